@@ -1,0 +1,126 @@
+//! Identities that cross process boundaries. Each is a newtype with `Display`; a raw integer never crosses a
+//! function boundary.
+
+use std::fmt;
+
+use serde::{Deserialize, Serialize};
+
+macro_rules! id {
+    ($(#[$doc:meta])* $name:ident($raw:ty), $prefix:literal) => {
+        $(#[$doc])*
+        #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+        pub struct $name(pub $raw);
+
+        impl fmt::Display for $name {
+            fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+                write!(f, concat!($prefix, "{}"), self.0)
+            }
+        }
+    };
+}
+
+id!(
+    /// One life of the coordinator: +1 at each start. Messages of a smaller epoch are refused.
+    Epoch(u32), "epoch-"
+);
+id!(
+    /// A worker node, named by the coordinator at registration.
+    NodeId(u64), "node-"
+);
+id!(
+    /// One life of a worker process; drawn by the worker's driver at its start.
+    NodeSession(u64), "session-"
+);
+id!(
+    /// A registered application, cluster-wide unique, never reused (thesis 5.4.1).
+    AppId(u64), "app-"
+);
+id!(
+    /// One life of an application that keeps its [`AppId`] over restarts.
+    AppIncarnation(u32), "incarnation-"
+);
+id!(
+    /// A task, unique inside its application.
+    TaskId(u32), "task-"
+);
+id!(
+    /// A job's index inside its task.
+    JobIndex(u32), "job-"
+);
+id!(
+    /// A device's index inside its node.
+    DeviceIndex(u16), "device-"
+);
+id!(
+    /// One plan request of an application.
+    BatchId(u64), "batch-"
+);
+id!(
+    /// A driver's handle of one connection; means nothing outside the process that drew it.
+    LinkId(u64), "link-"
+);
+
+/// A job, cluster-wide: application, task, index.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+pub struct JobId {
+    /// The application that owns the job.
+    pub app: AppId,
+    /// The task inside the application.
+    pub task: TaskId,
+    /// The job inside the task.
+    pub index: JobIndex,
+}
+
+impl fmt::Display for JobId {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}/{}/{}", self.app.0, self.task.0, self.index.0)
+    }
+}
+
+/// One try at executing a job. Compared lexicographically, so a coordinator that lost its job state still issues
+/// larger attempts than any before it: fencing without per-job durability.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+pub struct Attempt {
+    /// The coordinator's epoch that issued the attempt.
+    pub epoch: Epoch,
+    /// Issued in increasing order inside one epoch.
+    pub sequence: u64,
+}
+
+impl fmt::Display for Attempt {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}.{}", self.epoch.0, self.sequence)
+    }
+}
+
+/// A job together with the attempt at it: what queues, executors and results are keyed by.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+pub struct JobAttempt {
+    /// The job.
+    pub job: JobId,
+    /// The attempt at it.
+    pub attempt: Attempt,
+}
+
+impl fmt::Display for JobAttempt {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}@{}", self.job, self.attempt)
+    }
+}
+
+/// The blake3 digest of some bytes: the name of a task allocation, a module or a result payload. Computed by drivers.
+#[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+pub struct ContentHash(pub [u8; 32]);
+
+impl fmt::Display for ContentHash {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        self.0.iter().try_for_each(|byte| write!(f, "{byte:02x}"))
+    }
+}
+
+impl fmt::Debug for ContentHash {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        // Eight hex digits tell contents apart in a log line.
+        self.0[..4].iter().try_for_each(|byte| write!(f, "{byte:02x}"))
+    }
+}

@@ -1,0 +1,427 @@
+//! What the tiers say to each other, as domain data. Wire formats are `proto`'s; payload bytes (programs, results,
+//! allocations) never enter a machine: messages carry their names and sizes only.
+
+use serde::{Deserialize, Serialize};
+
+use crate::{
+    device::{DeviceInfo, Requirements},
+    id::{
+        AppId, AppIncarnation, BatchId, ContentHash, DeviceIndex, Epoch, JobAttempt, JobId, JobIndex, NodeId, NodeSession,
+        TaskId,
+    },
+    program::Content,
+};
+
+/// The protocol this build speaks. A peer of another version is refused at hello.
+pub const PROTOCOL_VERSION: u32 = 1;
+
+/// Estimated work of a job: nanoseconds on a device of speed 1.0. Zero means unknown.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+pub struct CostNs(pub u64);
+
+/// Order inside one application: larger goes first, equal ones first come, first served.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+pub struct Priority(pub i32);
+
+/// How often the two ends of a session say that they are alive, and when silence means what. All in milliseconds.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Liveness {
+    /// Each side sends a heartbeat this often.
+    pub heartbeat_ms: u64,
+    /// Silence after which no new work is planned there.
+    pub suspect_ms: u64,
+    /// Silence after which a node's undelivered jobs get new attempts elsewhere.
+    pub dead_ms: u64,
+    /// After a closed connection, how long the peer may take to come back before it counts as dead.
+    pub reconnect_ms: u64,
+}
+
+impl Default for Liveness {
+    fn default() -> Self {
+        // 20-delivery.md, failure table: heartbeat 1 s, suspect 3 s, dead 10 s; a closed connection is suspect at once.
+        Self { heartbeat_ms: 1_000, suspect_ms: 3_000, dead_ms: 10_000, reconnect_ms: 2_000 }
+    }
+}
+
+/// How to reach a node's data plane.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Contact {
+    /// `host:port` addresses, tried side by side; the pinned certificate says which answer is the node's.
+    pub addresses: Vec<String>,
+    /// The node's certificate, DER; the application accepts no other.
+    pub certificate_der: Vec<u8>,
+}
+
+// ---------------------------------------------------------------- application <-> coordinator
+
+/// An application's first message.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct AppHello {
+    /// Must equal [`PROTOCOL_VERSION`].
+    pub protocol: u32,
+    /// For people.
+    pub name: String,
+    /// Fair-share weight, > 0 and finite.
+    pub weight: f64,
+    /// Who the application was before its connection broke, if it comes back.
+    pub resume: Option<(AppId, AppIncarnation)>,
+}
+
+/// One job of a plan request.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct PlanJob {
+    /// The job inside the request's task.
+    pub index: JobIndex,
+    /// Estimated work.
+    pub cost: CostNs,
+}
+
+/// One batch of jobs to be placed (10-scheduling.md section 1).
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct PlanRequest {
+    /// Repeated in the answer.
+    pub batch: BatchId,
+    /// The task of all the jobs.
+    pub task: TaskId,
+    /// The jobs.
+    pub jobs: Vec<PlanJob>,
+    /// What every job of the batch needs of a device.
+    pub needs: Requirements,
+    /// Task allocations and modules the jobs use: a device that holds them is preferred.
+    pub contents: Vec<Content>,
+}
+
+/// Attempts placed on one device.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct DevicePlan {
+    /// The device inside the node.
+    pub device: DeviceIndex,
+    /// In the order they should run.
+    pub jobs: Vec<JobAttempt>,
+}
+
+/// Attempts placed on one node, grouped by device.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct NodePlan {
+    /// The node.
+    pub node: NodeId,
+    /// The life of the node that the plan is for.
+    pub session: NodeSession,
+    /// How to reach it.
+    pub contact: Contact,
+    /// Its devices' shares.
+    pub devices: Vec<DevicePlan>,
+}
+
+/// Where jobs go. The answer to a plan request, or new attempts after a loss.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Plan {
+    /// The request answered; `None` when the coordinator re-plans on its own.
+    pub batch: Option<BatchId>,
+    /// Grouped by node.
+    pub nodes: Vec<NodePlan>,
+}
+
+/// Why a batch or a job waits.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub enum WaitReason {
+    /// No node is registered.
+    NoNode,
+    /// Nodes are there, but no device fulfils the requirements.
+    NoFittingDevice,
+}
+
+/// Why a job ended without a result.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub enum JobFailure {
+    /// The program is wrong; a further attempt would fail the same way. The text names the command.
+    InvalidProgram(String),
+    /// A launch ran past its limit.
+    Timeout,
+    /// The device was lost while the attempt was on it.
+    DeviceLost(String),
+    /// The device had no memory for it.
+    OutOfMemory(String),
+    /// A task allocation or module could not be had.
+    ContentUnavailable(ContentHash),
+    /// Too many attempts ended with the device or node (poison); the text is the last one's.
+    Poison(String),
+    /// Cancelled by the application or by an operator.
+    Cancelled,
+}
+
+impl JobFailure {
+    /// Whether another attempt, elsewhere, may succeed.
+    #[must_use]
+    pub const fn can_be_retried(&self) -> bool {
+        match self {
+            Self::Timeout | Self::DeviceLost(_) | Self::OutOfMemory(_) | Self::ContentUnavailable(_) => true,
+            Self::InvalidProgram(_) | Self::Poison(_) | Self::Cancelled => false,
+        }
+    }
+}
+
+/// Application to coordinator.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub enum AppToCoordinator {
+    /// First message of a session.
+    Hello(AppHello),
+    /// Place these jobs.
+    Plan(PlanRequest),
+    /// These jobs need no further attempt: their results are here (answer to a re-plan that came too late).
+    AlreadyDelivered(Vec<JobId>),
+    /// The data plane of this node cannot be reached from here: move this application's jobs off it.
+    Unreachable {
+        /// The node.
+        node: NodeId,
+        /// The life of it that was tried.
+        session: NodeSession,
+    },
+    /// Forget the undelivered jobs of this task and stop them.
+    Cancel(TaskId),
+    /// Alive.
+    Heartbeat {
+        /// Echoed in the answer.
+        sequence: u64,
+    },
+    /// No more jobs will come; everything of this application can be freed.
+    Goodbye,
+}
+
+/// Coordinator to application.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub enum CoordinatorToApp {
+    /// Registered.
+    Welcome {
+        /// The cluster-wide id.
+        app: AppId,
+        /// Which life of it this is.
+        incarnation: AppIncarnation,
+        /// The coordinator's life.
+        epoch: Epoch,
+        /// Timings to keep.
+        liveness: Liveness,
+    },
+    /// Not registered; the connection closes.
+    Refused {
+        /// Why, for people.
+        reason: String,
+    },
+    /// Where jobs go.
+    Plan(Plan),
+    /// The batch is kept and will be planned when this changes.
+    Waiting {
+        /// The batch.
+        batch: BatchId,
+        /// Why.
+        reason: WaitReason,
+    },
+    /// The coordinator gave a job up.
+    JobFailed {
+        /// The job.
+        job: JobId,
+        /// Why.
+        failure: JobFailure,
+    },
+    /// Answer to a heartbeat.
+    HeartbeatAck {
+        /// Of the heartbeat answered.
+        sequence: u64,
+    },
+}
+
+// ---------------------------------------------------------------- node <-> coordinator
+
+/// A node's first message.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct NodeHello {
+    /// Must equal [`PROTOCOL_VERSION`].
+    pub protocol: u32,
+    /// For people, and the node's identity over restarts: a second session of one name fences the first.
+    pub name: String,
+    /// This life of the worker process.
+    pub session: NodeSession,
+    /// The devices, by [`DeviceIndex`].
+    pub devices: Vec<DeviceInfo>,
+    /// The data plane.
+    pub contact: Contact,
+    /// Attempts the node holds, executed but undelivered ones too (after a reconnect).
+    pub inventory: Vec<JobAttempt>,
+}
+
+/// One finished execution.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Executed {
+    /// What ran.
+    pub job: JobAttempt,
+    /// Where it ran (a local steal may have moved it).
+    pub device: DeviceIndex,
+    /// Measured device time in nanoseconds: what fairness charges.
+    pub device_time_ns: u64,
+    /// `None` when it completed.
+    pub failure: Option<JobFailure>,
+}
+
+/// How one device of a node stands.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct DeviceLoad {
+    /// Jobs queued or staged.
+    pub queued_jobs: u32,
+    /// Jobs running (0 or 1).
+    pub running_jobs: u32,
+}
+
+/// Node to coordinator.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub enum NodeToCoordinator {
+    /// First message of a session.
+    Hello(NodeHello),
+    /// Alive, and how the devices stand.
+    Heartbeat {
+        /// Echoed in the answer.
+        sequence: u64,
+        /// By [`DeviceIndex`].
+        devices: Vec<DeviceLoad>,
+        /// Executed results not yet acknowledged, in bytes.
+        spool_bytes: u64,
+    },
+    /// What ended since the last report. Batched by the machine: every 5 ms or 64 jobs.
+    Report {
+        /// Device free: for scheduling.
+        executed: Vec<Executed>,
+        /// Acknowledged by the application: the job is over.
+        delivered: Vec<JobAttempt>,
+    },
+    /// A device is gone; its jobs were requeued on siblings or reported failed.
+    DeviceLost {
+        /// Which.
+        device: DeviceIndex,
+        /// Why, for people.
+        reason: String,
+    },
+    /// A drained node leaves: it holds no job any more.
+    Goodbye,
+}
+
+/// Coordinator to node.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub enum CoordinatorToNode {
+    /// Registered.
+    Welcome {
+        /// The node's id.
+        node: NodeId,
+        /// The coordinator's life.
+        epoch: Epoch,
+        /// Timings to keep.
+        liveness: Liveness,
+    },
+    /// Not registered, or expelled (a newer session of the same name); the connection closes.
+    Refused {
+        /// Why, for people.
+        reason: String,
+    },
+    /// An application may send jobs.
+    AppJoined {
+        /// Which.
+        app: AppId,
+        /// Fair-share weight.
+        weight: f64,
+    },
+    /// Everything of this application can be freed.
+    AppLeft {
+        /// Which.
+        app: AppId,
+    },
+    /// Forget these attempts; stop them at the next launch boundary if they run.
+    Cancel {
+        /// Which.
+        jobs: Vec<JobAttempt>,
+    },
+    /// Take no new work, finish what runs, say goodbye.
+    Drain,
+    /// Answer to a heartbeat.
+    HeartbeatAck {
+        /// Of the heartbeat answered.
+        sequence: u64,
+    },
+}
+
+// ---------------------------------------------------------------- application <-> node (data plane)
+
+/// One job on its way to a node, without its program's bytes.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct JobTicket {
+    /// Which attempt.
+    pub job: JobAttempt,
+    /// The device the plan names.
+    pub device: DeviceIndex,
+    /// Order inside the application.
+    pub priority: Priority,
+    /// Estimated work.
+    pub cost: CostNs,
+    /// What must be on the node before the job can be staged.
+    pub contents: Vec<Content>,
+}
+
+/// An application's word that a result is safe.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct ResultAck {
+    /// Which attempt.
+    pub job: JobAttempt,
+    /// blake3 of the payload received.
+    pub digest: ContentHash,
+}
+
+/// Application to node.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub enum AppToNode {
+    /// First message of a link.
+    Hello {
+        /// Must equal [`PROTOCOL_VERSION`].
+        protocol: u32,
+        /// Who.
+        app: AppId,
+        /// Which life of it.
+        incarnation: AppIncarnation,
+    },
+    /// Queue these. The frame's payload is the jobs' encoded programs, one after the other.
+    Jobs(Vec<JobTicket>),
+    /// These results are safe.
+    Acks(Vec<ResultAck>),
+    /// Forget these attempts.
+    Cancel(Vec<JobAttempt>),
+}
+
+/// What became of an attempt, as its application sees it.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct ResultHeader {
+    /// Which attempt.
+    pub job: JobAttempt,
+    /// Where it ran.
+    pub device: DeviceIndex,
+    /// Measured device time in nanoseconds.
+    pub device_time_ns: u64,
+    /// `Ok`: lengths in bytes of the sections of the payload, one for each device-to-host copy, in program order.
+    pub outcome: Result<Vec<u64>, JobFailure>,
+    /// blake3 of the payload.
+    pub digest: ContentHash,
+}
+
+/// Node to application.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub enum NodeToApp {
+    /// The link stands.
+    Welcome {
+        /// Who answers.
+        node: NodeId,
+        /// Which life of it.
+        session: NodeSession,
+    },
+    /// The link is refused and closes.
+    Refused {
+        /// Why, for people.
+        reason: String,
+    },
+    /// An attempt ended. The frame's payload is the sections, one after the other.
+    Result(ResultHeader),
+}
