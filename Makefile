@@ -1,0 +1,32 @@
+# Everyday commands. `make demo` renders a picture on this machine; `make test` passes every test.
+
+.PHONY: demo test check build bench clean-demo
+
+# Installs what is missing, builds, and renders the Cornell box through an embedded farm.
+demo:
+	./deploy/setup.sh
+	cargo build --release --locked
+	./target/release/farmctl scene cornell demo/cornell
+	./target/release/farmctl render demo/cornell -o demo/cornell.png --size 256x256 --spp 64
+	./target/release/farmctl render demo/cornell -o demo/cornell.exr --size 256x256 --spp 64
+	@echo "look at demo/cornell.png and demo/cornell.exr"
+
+build:
+	cargo build --release --locked
+
+# Everything: lints, unit, property, GPU (lavapipe), multi-process, containers (where a Docker daemon answers).
+test:
+	./deploy/setup.sh test
+	cargo nextest run --workspace --locked --features bdpt-kernel/farm
+	cargo test --workspace --doc --locked --quiet
+	./tests/compose.sh
+
+# What a commit must pass besides the tests.
+check:
+	cargo fmt --check
+	cargo clippy --workspace --all-targets --locked -- -D warnings
+	RUSTDOCFLAGS="-D warnings" cargo doc --workspace --no-deps --locked --quiet
+	@if command -v cargo-deny >/dev/null 2>&1; then cargo deny check; else echo "cargo-deny is not installed: tests/crate_table.rs checks the crate table"; fi
+
+bench:
+	./target/release/farmctl bench scheduler

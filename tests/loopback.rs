@@ -1,0 +1,105 @@
+//! The whole farm as real processes on 127.0.0.1: a coordinator, workers on lavapipe, `farmctl` as the application.
+//! Whatever happens to the workers, the image is byte for byte the undisturbed one.
+
+use std::{fs, path::Path};
+
+use tempfile::TempDir;
+use tests::{Farm, Process, Signal, farmctl};
+
+/// Small enough for lavapipe, large enough for many jobs (a 3 x 2 raster of tiles, several sample slices).
+const RENDER: [&str; 6] = ["--size", "160x128", "--spp", "32", "--seed", "7"];
+
+fn cornell(folder: &TempDir) -> String {
+    let scene = folder.path().join("cornell").display().to_string();
+    let made = farmctl(["scene", "cornell", &scene]);
+    assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
+    scene
+}
+
+fn start_render(farm: &Farm, scene: &str, image: &Path) -> Process {
+    let image = image.display().to_string();
+    let fixed = ["--coordinator", &farm.grpc, "render", scene, "-o", &image, "--progress", "ndjson"];
+    Process::start("farmctl", fixed.iter().chain(RENDER.iter()))
+}
+
+fn finish_render(render: Process, image: &Path) -> Vec<u8> {
+    let (status, stderr) = render.finish();
+    assert!(status.success(), "{status}; stderr:\n{stderr}");
+    fs::read(image).expect("a finished render leaves its image")
+}
+
+fn wait_until_jobs_done(render: &mut Process, jobs: u64) {
+    render.wait_for(|line| line["event"] == "progress" && line["jobs_done"].as_u64().is_some_and(|done| done >= jobs));
+}
+
+#[test]
+fn an_image_survives_a_killed_worker_and_a_joining_one_byte_for_byte() {
+    let folder = TempDir::new().expect("a temporary folder");
+    let scene = cornell(&folder);
+
+    let quiet_image = folder.path().join("quiet.exr");
+    let quiet_farm = Farm::with_cpu_workers(1);
+    let quiet = finish_render(start_render(&quiet_farm, &scene, &quiet_image), &quiet_image);
+    drop(quiet_farm);
+
+    let image = folder.path().join("disturbed.exr");
+    let mut farm = Farm::with_cpu_workers(3);
+    let mut render = start_render(&farm, &scene, &image);
+    wait_until_jobs_done(&mut render, 2);
+    farm.workers[1].signal(Signal::Kill);
+    farm.begin_worker("cpu");
+    let disturbed = finish_render(render, &image);
+
+    assert_eq!(quiet.len(), disturbed.len(), "the images differ in size");
+    assert!(quiet == disturbed, "the images differ in bytes");
+}
+
+#[test]
+fn another_seed_gives_another_image() {
+    // Negative control of the byte comparison above.
+    let folder = TempDir::new().expect("a temporary folder");
+    let scene = cornell(&folder);
+    let render = |seed: &str| {
+        let image = folder.path().join(format!("seed-{seed}.exr"));
+        let path = image.display().to_string();
+        let done = farmctl(["render", &scene, "-o", &path, "--size", "32x32", "--spp", "2", "--seed", seed]);
+        assert!(done.status.success(), "{}", String::from_utf8_lossy(&done.stderr));
+        fs::read(image).expect("the image is there")
+    };
+    assert_ne!(render("1"), render("2"));
+}
+
+#[test]
+fn an_interrupted_render_saves_a_partial_image_and_says_so() {
+    let folder = TempDir::new().expect("a temporary folder");
+    let scene = cornell(&folder);
+    let farm = Farm::with_cpu_workers(1);
+    let image = folder.path().join("partial.exr");
+    let mut render = start_render(&farm, &scene, &image);
+    wait_until_jobs_done(&mut render, 1);
+    render.signal(Signal::Int);
+    let (status, stderr) = render.finish();
+    assert_eq!(status.code(), Some(1), "an incomplete image is not a success; stderr:\n{stderr}");
+    assert!(stderr.contains("partial"), "stderr does not say that the image is partial:\n{stderr}");
+    assert!(fs::metadata(&image).is_ok_and(|file| file.len() > 0), "no partial image was saved");
+}
+
+#[test]
+fn sigterm_ends_every_daemon_in_order() {
+    let mut farm = Farm::with_cpu_workers(1);
+    let worker = farm.workers.pop().expect("one worker");
+    worker.signal(Signal::Term);
+    let (status, stderr) = worker.finish();
+    assert_eq!(status.code(), Some(0), "worker stderr:\n{stderr}");
+    farm.coordinator.signal(Signal::Term);
+    let (status, stderr) = farm.coordinator.finish();
+    assert_eq!(status.code(), Some(0), "coordinator stderr:\n{stderr}");
+}
+
+#[test]
+fn a_stranger_kernel_runs_through_the_sdk() {
+    let farm = Farm::with_cpu_workers(2);
+    let example = Process::start("examples/vector_add", ["--coordinator", &farm.grpc]);
+    let (status, stderr) = example.finish();
+    assert!(status.success(), "{status}; stderr:\n{stderr}");
+}
