@@ -1,0 +1,3 @@
+//! Scenes: the model after loading, and how files become it.
+
+pub mod model;
