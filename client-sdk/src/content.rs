@@ -1,0 +1,116 @@
+//! Task allocations and modules by content address: what the data server answers fetches from. Never sends anything
+//! itself, never holds a job allocation.
+
+use std::{
+    collections::{BTreeSet, HashMap},
+    sync::{Arc, PoisonError, RwLock},
+};
+
+use bytes::Bytes;
+use farm_core::{id::ContentHash, program::Content};
+
+/// The bytes of every live run's contents, shared between the runs that add to it and the data server that reads.
+///
+/// A lock, not an owner task: adding happens on preparing threads and must be visible before the first job that names
+/// the content is sent; reading happens on any number of fetch streams. It is held for a map operation only, bytes
+/// are reference-counted.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct ContentStore {
+    contents: Arc<RwLock<HashMap<ContentHash, Stored>>>,
+}
+
+#[derive(Debug)]
+struct Stored {
+    bytes: Bytes,
+    runs: usize,
+}
+
+impl ContentStore {
+    /// The bytes of a content that some live run owns.
+    pub(crate) fn get(&self, hash: &ContentHash) -> Option<Bytes> {
+        self.contents
+            .read()
+            .unwrap_or_else(PoisonError::into_inner)
+            .get(hash)
+            .map(|stored| stored.bytes.clone())
+    }
+
+    fn retain(&self, hash: ContentHash, bytes: Bytes) {
+        let mut contents = self.contents.write().unwrap_or_else(PoisonError::into_inner);
+        contents.entry(hash).or_insert(Stored { bytes, runs: 0 }).runs += 1;
+    }
+
+    fn release(&self, hash: &ContentHash) {
+        let mut contents = self.contents.write().unwrap_or_else(PoisonError::into_inner);
+        let last = contents.get_mut(hash).is_some_and(|stored| {
+            stored.runs -= 1;
+            stored.runs == 0
+        });
+        if last {
+            contents.remove(hash);
+        }
+    }
+}
+
+/// Where a task puts the data that all its jobs share. What one task adds, the tasks that depend on it may name too: it
+/// lives until the run ends.
+#[derive(Debug)]
+pub struct TaskData {
+    store: ContentStore,
+    added: BTreeSet<ContentHash>,
+}
+
+impl TaskData {
+    pub(crate) fn new(store: ContentStore) -> Self {
+        Self { store, added: BTreeSet::new() }
+    }
+
+    /// A task allocation: read-only for kernels, fetched once by each node that runs a job naming it. Its size must be
+    /// a positive multiple of 4, as for every buffer; `validate` says so when a program names it.
+    pub fn allocation(&mut self, bytes: impl Into<Bytes>) -> Content {
+        self.add(bytes.into())
+    }
+
+    /// A module: WGSL text.
+    pub fn module(&mut self, wgsl: impl Into<Bytes>) -> Content {
+        self.add(wgsl.into())
+    }
+
+    fn add(&mut self, bytes: Bytes) -> Content {
+        let content =
+            Content { hash: ContentHash(*blake3::hash(&bytes).as_bytes()), size_bytes: bytes.len() as u64 };
+        if self.added.insert(content.hash) {
+            self.store.retain(content.hash, bytes);
+        }
+        content
+    }
+}
+
+impl Drop for TaskData {
+    fn drop(&mut self) {
+        for hash in &self.added {
+            self.store.release(hash);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn content_lives_until_its_last_run_ends() {
+        let store = ContentStore::default();
+        let mut first = TaskData::new(store.clone());
+        let mut second = TaskData::new(store.clone());
+        let a = first.allocation(vec![1_u8; 8]);
+        assert_eq!(first.allocation(vec![1_u8; 8]), a, "the same bytes have the same name");
+        assert_eq!(second.module("abcdefgh").size_bytes, 8);
+        assert_eq!(second.allocation(vec![1_u8; 8]), a);
+        drop(first);
+        assert_eq!(store.get(&a.hash).as_deref(), Some(&[1_u8; 8][..]));
+        drop(second);
+        assert_eq!(store.get(&a.hash), None);
+        assert!(store.contents.read().unwrap().is_empty(), "nothing may stay behind");
+    }
+}

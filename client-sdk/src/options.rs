@@ -1,0 +1,97 @@
+//! Settings of one connection to a farm, checked once. Reads no environment and no file.
+
+use std::time::Duration;
+
+use crate::error::FarmError;
+
+/// How an application connects, and the bounds it keeps.
+#[derive(Clone, Debug, PartialEq)]
+pub struct FarmOptions {
+    /// `host:port` of the coordinator.
+    pub coordinator: String,
+    /// The application's name, for people.
+    pub name: String,
+    /// Fair-share weight, > 0 and finite.
+    pub weight: f64,
+    /// How long connecting and registering may take.
+    pub connect_timeout: Duration,
+    /// How long a lost coordinator is tried again before the run ends.
+    pub reconnect_timeout: Duration,
+    /// How long jobs may wait for a fitting device before the run ends.
+    pub patience: Duration,
+    /// Bounds of what is dispatched and not yet retrieved.
+    pub window: Window,
+}
+
+/// How much of a run is in memory at a time. Jobs beyond it stay undispatched.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Window {
+    /// Most jobs dispatched and not yet retrieved, of one run.
+    pub jobs: usize,
+    /// Most bytes of their encoded programs, of one run; one job is dispatched whatever its size.
+    pub program_bytes: usize,
+    /// Most bytes of results received and not yet retrieved, of the whole connection; when it is full, results wait in
+    /// the nodes' spools. One result is received whatever its size.
+    pub result_bytes: usize,
+}
+
+impl Default for Window {
+    fn default() -> Self {
+        Self { jobs: 8_192, program_bytes: 256 << 20, result_bytes: 256 << 20 }
+    }
+}
+
+impl FarmOptions {
+    /// Default settings: weight 1, 5 s to connect, 30 s to reconnect, 60 s of patience.
+    pub fn new(coordinator: impl Into<String>, name: impl Into<String>) -> Self {
+        Self {
+            coordinator: coordinator.into(),
+            name: name.into(),
+            weight: 1.0,
+            connect_timeout: Duration::from_secs(5),
+            reconnect_timeout: Duration::from_secs(30),
+            patience: Duration::from_secs(60),
+            window: Window::default(),
+        }
+    }
+
+    /// Refuses what cannot work, before anything is connected.
+    pub(crate) fn check(&self) -> Result<(), FarmError> {
+        let wrong = |option, reason: String| Err(FarmError::Options { option, reason });
+        match self.coordinator.rsplit_once(':') {
+            Some((host, port)) if !host.is_empty() && port.parse::<u16>().is_ok_and(|port| port > 0) => {}
+            _ => return wrong("coordinator", format!("`{}` is not HOST:PORT", self.coordinator)),
+        }
+        if !(self.weight.is_finite() && self.weight > 0.0) {
+            return wrong("weight", format!("{} is not a positive number", self.weight));
+        }
+        if self.window.jobs == 0 || self.window.program_bytes == 0 || self.window.result_bytes == 0 {
+            return wrong("window", format!("{:?} has no room", self.window));
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn unusable_options_are_named() {
+        let good = FarmOptions::new("127.0.0.1:7700", "test");
+        good.check().unwrap();
+        FarmOptions::new("[::1]:7700", "test").check().unwrap();
+        let option = |options: FarmOptions| match options.check() {
+            Err(FarmError::Options { option, .. }) => option,
+            other => panic!("expected a refused option, got {other:?}"),
+        };
+        for address in ["", "localhost", ":7700", "host:", "host:0", "host:65536", "host:port"] {
+            assert_eq!(option(FarmOptions::new(address, "test")), "coordinator", "{address}");
+        }
+        for weight in [0.0, -1.0, f64::NAN, f64::INFINITY] {
+            assert_eq!(option(FarmOptions { weight, ..good.clone() }), "weight");
+        }
+        let window = Window { jobs: 0, ..Window::default() };
+        assert_eq!(option(FarmOptions { window, ..good }), "window");
+    }
+}
