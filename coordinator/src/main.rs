@@ -1,1 +1,3 @@
+//! The binary `farm-coordinator`.
+
 fn main() {}

@@ -1,0 +1,209 @@
+//! Binary encodings of the data plane: job programs and frame headers, and the digest that names contents.
+//!
+//! The one module that names bincode (pinned to 2.0.1, see the workspace manifest). Every decoder has a byte cap, and
+//! what it may allocate is bounded by a small multiple of the bytes that really came.
+
+use bytes::{BufMut, Bytes, BytesMut};
+use farm_core::{id::ContentHash, program::JobProgram};
+use serde::{Serialize, de::DeserializeOwned};
+use thiserror::Error;
+
+/// Most bytes of one frame header (a `Jobs` header of 4,096 tickets is about 0.5 MB).
+pub const MAX_HEADER_BYTES: usize = 16 << 20;
+/// Most bytes of one encoded job program, its host-to-device bytes included.
+pub const MAX_PROGRAM_BYTES: usize = 256 << 20;
+/// Programs below this size are packed side by side into one buffer, in bytes.
+const PACK_BELOW_BYTES: usize = 64 << 10;
+
+/// Some bytes could not be encoded or decoded. Not to be retried: the same bytes fail the same way.
+#[derive(Debug, Error)]
+pub enum CodecError {
+    /// More bytes than the cap of their type.
+    #[error("{what} of {bytes} B is over the cap of {cap} B")]
+    TooLarge {
+        /// What was coded.
+        what: &'static str,
+        /// Its size.
+        bytes: u64,
+        /// The most it may have.
+        cap: u64,
+    },
+    /// The bytes are not a value of the type.
+    #[error("{what} does not decode: {reason}")]
+    Malformed {
+        /// What was decoded.
+        what: &'static str,
+        /// The decoder's words.
+        reason: String,
+    },
+    /// The value does not encode.
+    #[error("{what} does not encode: {reason}")]
+    Unencodable {
+        /// What was encoded.
+        what: &'static str,
+        /// The encoder's words.
+        reason: String,
+    },
+}
+
+/// The name of some bytes: their blake3 digest.
+#[must_use]
+pub fn content_hash(bytes: &[u8]) -> ContentHash {
+    ContentHash(*blake3::hash(bytes).as_bytes())
+}
+
+/// Encodes a job program.
+///
+/// # Errors
+/// It is over [`MAX_PROGRAM_BYTES`].
+pub fn encode_program(program: &JobProgram) -> Result<Bytes, CodecError> {
+    let mut buffer = BytesMut::with_capacity(256);
+    encode_into(&mut buffer, "job program", program, MAX_PROGRAM_BYTES)?;
+    Ok(buffer.freeze())
+}
+
+/// Decodes a job program. The result is well-formed but not yet valid: `farm_core::program::validate` says that.
+///
+/// # Errors
+/// The bytes are not one program, or are over [`MAX_PROGRAM_BYTES`].
+pub fn decode_program(bytes: &[u8]) -> Result<JobProgram, CodecError> {
+    decode("job program", bytes, MAX_PROGRAM_BYTES)
+}
+
+/// The payload of a `Jobs` frame: the encoded programs in the order of the tickets, each behind its length (`u32`,
+/// little-endian). Small ones are copied side by side, large ones are passed on as they are.
+#[must_use]
+pub fn pack_programs<'a>(programs: impl IntoIterator<Item = &'a Bytes>) -> Vec<Bytes> {
+    let mut chunks = Vec::new();
+    let mut buffer = BytesMut::new();
+    for program in programs {
+        let length = u32::try_from(program.len()).expect("encode_program caps programs far below 4 GiB");
+        buffer.put_u32_le(length);
+        if program.len() < PACK_BELOW_BYTES {
+            buffer.extend_from_slice(program);
+        } else {
+            chunks.push(buffer.split().freeze());
+            chunks.push(program.clone());
+        }
+    }
+    if !buffer.is_empty() {
+        chunks.push(buffer.freeze());
+    }
+    chunks
+}
+
+/// The encoded programs of a `Jobs` frame's payload: `count` of them, as slices of the payload (no copy).
+///
+/// # Errors
+/// The payload does not hold exactly `count` programs within their cap.
+pub fn unpack_programs(mut payload: Bytes, count: usize) -> Result<Vec<Bytes>, CodecError> {
+    const WHAT: &str = "payload of programs";
+    // Each program takes at least its length field: the count is bounded by the bytes before anything is allocated.
+    if count > payload.len() / 4 {
+        return Err(malformed(WHAT, format!("{} B cannot hold {count} programs", payload.len())));
+    }
+    let mut programs = Vec::with_capacity(count);
+    for index in 0..count {
+        let Some((length, _)) = payload.split_first_chunk::<4>() else {
+            return Err(malformed(WHAT, format!("ends before program {index} of {count}")));
+        };
+        let length = u32::from_le_bytes(*length) as usize;
+        if length > MAX_PROGRAM_BYTES {
+            return Err(too_large("job program", length, MAX_PROGRAM_BYTES));
+        }
+        let _ = payload.split_to(4);
+        if length > payload.len() {
+            return Err(malformed(WHAT, format!("ends inside program {index} of {count}")));
+        }
+        programs.push(payload.split_to(length));
+    }
+    if payload.is_empty() {
+        Ok(programs)
+    } else {
+        Err(malformed(WHAT, format!("{} B follow the last of {count} programs", payload.len())))
+    }
+}
+
+/// Appends a frame header to `buffer`; gives the bytes appended.
+pub(crate) fn encode_header<H: Serialize>(buffer: &mut BytesMut, header: &H) -> Result<usize, CodecError> {
+    encode_into(buffer, "frame header", header, MAX_HEADER_BYTES)
+}
+
+/// Decodes a whole frame header.
+pub(crate) fn decode_header<H: DeserializeOwned>(bytes: &[u8]) -> Result<H, CodecError> {
+    decode("frame header", bytes, MAX_HEADER_BYTES)
+}
+
+fn encode_into<T: Serialize>(
+    buffer: &mut BytesMut,
+    what: &'static str,
+    value: &T,
+    cap: usize,
+) -> Result<usize, CodecError> {
+    struct Appender<'a> {
+        buffer: &'a mut BytesMut,
+        end: usize,
+    }
+    impl bincode::enc::write::Writer for Appender<'_> {
+        fn write(&mut self, bytes: &[u8]) -> Result<(), bincode::error::EncodeError> {
+            if self.buffer.len() + bytes.len() > self.end {
+                return Err(bincode::error::EncodeError::Other(OVER_CAP));
+            }
+            self.buffer.extend_from_slice(bytes);
+            Ok(())
+        }
+    }
+    const OVER_CAP: &str = "over the cap";
+
+    let start = buffer.len();
+    let mut appender = Appender { buffer, end: start + cap };
+    let outcome = bincode::serde::encode_into_writer(value, &mut appender, bincode::config::standard());
+    match outcome {
+        Ok(()) => Ok(buffer.len() - start),
+        Err(error) => {
+            buffer.truncate(start);
+            Err(match error {
+                bincode::error::EncodeError::Other(OVER_CAP) => too_large(what, cap + 1, cap),
+                error => CodecError::Unencodable { what, reason: error.to_string() },
+            })
+        }
+    }
+}
+
+fn decode<T: DeserializeOwned>(what: &'static str, bytes: &[u8], cap: usize) -> Result<T, CodecError> {
+    // bincode's limit counts what is claimed in memory, not what is read: a one-byte varint claims eight. Sixteen times
+    // the input is enough for every honest value; the limit is a constant of the type, so the next step up is taken.
+    if bytes.len() > cap {
+        Err(too_large(what, bytes.len(), cap))
+    } else if bytes.len() <= 4 << 10 {
+        decode_within::<T, { 64 << 10 }>(what, bytes)
+    } else if bytes.len() <= 256 << 10 {
+        decode_within::<T, { 4 << 20 }>(what, bytes)
+    } else if bytes.len() <= 16 << 20 {
+        decode_within::<T, { 256 << 20 }>(what, bytes)
+    } else {
+        decode_within::<T, { 4 << 30 }>(what, bytes)
+    }
+}
+
+fn decode_within<T: DeserializeOwned, const LIMIT_BYTES: usize>(
+    what: &'static str,
+    bytes: &[u8],
+) -> Result<T, CodecError> {
+    let config = bincode::config::standard().with_limit::<LIMIT_BYTES>();
+    let (value, read) = bincode::serde::decode_from_slice(bytes, config)
+        .map_err(|error| CodecError::Malformed { what, reason: error.to_string() })?;
+    if read == bytes.len() {
+        Ok(value)
+    } else {
+        Err(malformed(what, format!("{} B follow the value", bytes.len() - read)))
+    }
+}
+
+fn malformed(what: &'static str, reason: String) -> CodecError {
+    CodecError::Malformed { what, reason }
+}
+
+fn too_large(what: &'static str, bytes: usize, cap: usize) -> CodecError {
+    CodecError::TooLarge { what, bytes: bytes as u64, cap: cap as u64 }
+}

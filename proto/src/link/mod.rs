@@ -1,0 +1,138 @@
+//! The data plane: one QUIC connection between an application (which dials) and a node (which listens).
+//!
+//! What travels on it:
+//! - **Frames** (a typed header and raw payload bytes). Those with at most [`SMALL_PAYLOAD_BYTES`] of payload go, in the
+//!   order they were sent and coalesced, over one long-lived stream in each direction. Larger ones each open a stream
+//!   of their own, so that a result of 26 MB does not hold up the small ones; they may overtake and be overtaken. The
+//!   one promise across both: a link's first small frame (the hello) is received before any large one.
+//! - **Content fetches**: the node asks by digest, the application answers from its [`ContentSource`].
+//!
+//! Every queue is bounded: a full one makes `send` wait and `try_send` refuse; a receiver that does not read stops its
+//! peer through QUIC's flow control. Every length is checked against its cap before anything is allocated.
+//! It never looks into payloads, and knows nothing about jobs or applications.
+
+mod connect;
+mod fetch;
+mod receive;
+mod send;
+
+use std::{fmt, sync::Arc};
+
+use bytes::Bytes;
+use farm_core::id::ContentHash;
+use serde::{Serialize, de::DeserializeOwned};
+use thiserror::Error;
+
+pub use self::{
+    connect::{BindError, CONNECT_TIMEOUT, ConnectError, DataServer, Incoming, connect},
+    fetch::FetchError,
+    receive::LinkReceiver,
+    send::{LinkSender, TrySendError},
+};
+use crate::codec::CodecError;
+
+/// Frames with at most this much payload share the ordered stream, in bytes.
+pub const SMALL_PAYLOAD_BYTES: usize = 64 << 10;
+/// Most payload of one frame, in bytes: the most a program may yield (`ProgramQuota::result_bytes`).
+pub const MAX_PAYLOAD_BYTES: u64 = 1 << 30;
+/// Most bytes of one content (task allocation or module).
+pub const MAX_CONTENT_BYTES: u64 = 16 << 30;
+/// Frames that wait to be sent on one link, and received frames that wait to be read: at most this many each.
+pub const QUEUED_FRAMES: usize = 4_096;
+/// Large frames on the way at once in one direction of a link.
+pub const BULK_STREAMS: u32 = 8;
+/// Content fetches on the way at once on one link; further ones wait.
+pub const FETCH_STREAMS: u32 = 8;
+
+/// What can be a frame's header: `farm_core`'s `AppToNode` and `NodeToApp`.
+pub trait Header: Serialize + DeserializeOwned + fmt::Debug + Send + Sync + 'static {}
+
+impl<H: Serialize + DeserializeOwned + fmt::Debug + Send + Sync + 'static> Header for H {}
+
+/// One received frame.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Frame<H> {
+    /// What it says.
+    pub header: H,
+    /// Raw bytes; empty for most headers.
+    pub payload: Bytes,
+}
+
+/// The two ends of an established link: `S` is what this side says, `R` what it hears. The link closes when the
+/// receiver and every sender are dropped (queued frames are lost then; see [`LinkSender::close_after_sent`]).
+#[derive(Debug)]
+pub struct Link<S, R> {
+    /// Cloneable.
+    pub sender: LinkSender<S>,
+    /// The one reader.
+    pub receiver: LinkReceiver<R>,
+}
+
+/// Answers the other side's content fetches: the bytes of a digest, or `None` if they are not here. Called on a network
+/// task: it looks up, it does not compute or block.
+#[derive(Clone)]
+pub struct ContentSource(Arc<dyn Fn(ContentHash) -> Option<Bytes> + Send + Sync>);
+
+impl ContentSource {
+    /// A source that asks `lookup`.
+    pub fn new(lookup: impl Fn(ContentHash) -> Option<Bytes> + Send + Sync + 'static) -> Self {
+        Self(Arc::new(lookup))
+    }
+
+    /// A source that has nothing.
+    #[must_use]
+    pub fn empty() -> Self {
+        Self::new(|_| None)
+    }
+
+    fn get(&self, hash: ContentHash) -> Option<Bytes> {
+        (self.0)(hash)
+    }
+}
+
+impl fmt::Debug for ContentSource {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("ContentSource")
+    }
+}
+
+/// Why a link carries nothing further. Final: a new link may be tried.
+#[derive(Clone, Debug, PartialEq, Eq, Error)]
+pub enum LinkError {
+    /// The other side closed it.
+    #[error("closed by the peer: {reason}")]
+    ClosedByPeer {
+        /// Its words.
+        reason: String,
+    },
+    /// This side closed it.
+    #[error("closed here: {reason}")]
+    ClosedHere {
+        /// The words given.
+        reason: String,
+    },
+    /// The peer fell silent, or the network lost it.
+    #[error("lost: {reason}")]
+    Lost {
+        /// The network stack's words.
+        reason: String,
+    },
+    /// The peer broke the protocol; the link was closed for it.
+    #[error("protocol broken by the peer: {reason}")]
+    Protocol {
+        /// How.
+        reason: String,
+    },
+    /// A frame is over its cap and was not sent; the link stands.
+    #[error("frame not sent: {reason}")]
+    Frame {
+        /// Which cap.
+        reason: String,
+    },
+}
+
+impl From<CodecError> for LinkError {
+    fn from(error: CodecError) -> Self {
+        Self::Frame { reason: error.to_string() }
+    }
+}

@@ -1,0 +1,145 @@
+//! TLS of the data plane: a node's self-signed certificate and the application's check of it.
+//!
+//! The application trusts exactly the certificate that the coordinator's plan names (TLS 1.3 only, no 0-RTT); there is no
+//! authority, no name check and no expiry. It never decides who may join: a later issue brings the farm's own authority.
+
+use std::sync::Arc;
+
+use quinn::crypto::rustls::{QuicClientConfig, QuicServerConfig};
+use rustls::{
+    CertificateError, DigitallySignedStruct, Error, SignatureScheme,
+    client::danger::{HandshakeSignatureValid, ServerCertVerified, ServerCertVerifier},
+    crypto::{CryptoProvider, WebPkiSupportedAlgorithms, ring, verify_tls13_signature},
+    pki_types::{CertificateDer, PrivateKeyDer, ServerName, UnixTime},
+};
+use thiserror::Error;
+
+/// What both ends must speak; a peer of another protocol is refused in the handshake.
+const ALPN: &[u8] = b"gleaner-data/1";
+/// The name in every node certificate. Nobody compares it: the pinned bytes say who it is.
+pub(crate) const NODE_NAME: &str = "gleaner-node";
+
+/// A TLS configuration could not be made.
+#[derive(Debug, Error)]
+pub enum TlsError {
+    /// The certificate could not be generated.
+    #[error("cannot make a node certificate: {0}")]
+    Certificate(#[from] rcgen::Error),
+    /// The TLS library refused the configuration.
+    #[error("cannot configure TLS: {0}")]
+    Configuration(String),
+}
+
+/// A node's identity on the data plane; lives as long as the process.
+#[derive(Debug)]
+pub struct NodeCertificate {
+    certificate: CertificateDer<'static>,
+    key: PrivateKeyDer<'static>,
+}
+
+impl NodeCertificate {
+    /// A fresh self-signed certificate (ECDSA P-256).
+    ///
+    /// # Errors
+    /// The system gives no randomness.
+    pub fn generate() -> Result<Self, TlsError> {
+        let made = rcgen::generate_simple_self_signed([NODE_NAME.to_owned()])?;
+        let key = PrivateKeyDer::try_from(made.signing_key.serialize_der())
+            .map_err(|reason| TlsError::Configuration(reason.to_owned()))?;
+        Ok(Self { certificate: made.cert.der().clone(), key })
+    }
+
+    /// The certificate in DER: what a plan's contact carries.
+    #[must_use]
+    pub fn der(&self) -> &[u8] {
+        &self.certificate
+    }
+
+    /// The server's side.
+    pub(crate) fn server_config(&self) -> Result<QuicServerConfig, TlsError> {
+        let mut config = rustls::ServerConfig::builder_with_provider(provider())
+            .with_protocol_versions(&[&rustls::version::TLS13])
+            .map_err(configuration)?
+            .with_no_client_auth()
+            .with_single_cert(vec![self.certificate.clone()], self.key.clone_key())
+            .map_err(configuration)?;
+        config.alpn_protocols = vec![ALPN.to_vec()];
+        config.max_early_data_size = 0;
+        // A link lives as long as its application: session tickets would only cost packets.
+        config.send_tls13_tickets = 0;
+        QuicServerConfig::try_from(config).map_err(|error| TlsError::Configuration(error.to_string()))
+    }
+}
+
+/// The client's side: accepts the one certificate given, nothing else.
+pub(crate) fn pinned_client_config(certificate_der: &[u8]) -> Result<QuicClientConfig, TlsError> {
+    let provider = provider();
+    let verifier = PinnedCertificate {
+        expected: CertificateDer::from(certificate_der.to_vec()),
+        algorithms: provider.signature_verification_algorithms,
+    };
+    let mut config = rustls::ClientConfig::builder_with_provider(provider)
+        .with_protocol_versions(&[&rustls::version::TLS13])
+        .map_err(configuration)?
+        .dangerous()
+        .with_custom_certificate_verifier(Arc::new(verifier))
+        .with_no_client_auth();
+    config.alpn_protocols = vec![ALPN.to_vec()];
+    config.enable_early_data = false;
+    config.resumption = rustls::client::Resumption::disabled();
+    QuicClientConfig::try_from(config).map_err(|error| TlsError::Configuration(error.to_string()))
+}
+
+/// Accepts exactly one certificate, and only from who holds its key.
+#[derive(Debug)]
+struct PinnedCertificate {
+    expected: CertificateDer<'static>,
+    algorithms: WebPkiSupportedAlgorithms,
+}
+
+impl ServerCertVerifier for PinnedCertificate {
+    fn verify_server_cert(
+        &self,
+        end_entity: &CertificateDer<'_>,
+        _intermediates: &[CertificateDer<'_>],
+        _server_name: &ServerName<'_>,
+        _ocsp_response: &[u8],
+        _now: UnixTime,
+    ) -> Result<ServerCertVerified, Error> {
+        if *end_entity == self.expected {
+            Ok(ServerCertVerified::assertion())
+        } else {
+            Err(Error::InvalidCertificate(CertificateError::ApplicationVerificationFailure))
+        }
+    }
+
+    fn verify_tls12_signature(
+        &self,
+        _message: &[u8],
+        _certificate: &CertificateDer<'_>,
+        _signature: &DigitallySignedStruct,
+    ) -> Result<HandshakeSignatureValid, Error> {
+        Err(Error::General("TLS 1.2 is not spoken here".to_owned()))
+    }
+
+    fn verify_tls13_signature(
+        &self,
+        message: &[u8],
+        certificate: &CertificateDer<'_>,
+        signature: &DigitallySignedStruct,
+    ) -> Result<HandshakeSignatureValid, Error> {
+        verify_tls13_signature(message, certificate, signature, &self.algorithms)
+    }
+
+    fn supported_verify_schemes(&self) -> Vec<SignatureScheme> {
+        self.algorithms.supported_schemes()
+    }
+}
+
+fn provider() -> Arc<CryptoProvider> {
+    Arc::new(ring::default_provider())
+}
+
+fn configuration(error: Error) -> TlsError {
+    TlsError::Configuration(error.to_string())
+}
