@@ -148,6 +148,9 @@ pub enum JobFailure {
     Poison(String),
     /// Cancelled by the application or by an operator.
     Cancelled,
+    /// The node gave the job back unexecuted (it drains, it is full, or the result could not be handed over intact).
+    /// Nobody's fault: a further attempt follows and no crash is counted.
+    Returned,
 }
 
 impl JobFailure {
@@ -155,7 +158,11 @@ impl JobFailure {
     #[must_use]
     pub const fn can_be_retried(&self) -> bool {
         match self {
-            Self::Timeout | Self::DeviceLost(_) | Self::OutOfMemory(_) | Self::ContentUnavailable(_) => true,
+            Self::Timeout
+            | Self::DeviceLost(_)
+            | Self::OutOfMemory(_)
+            | Self::ContentUnavailable(_)
+            | Self::Returned => true,
             Self::InvalidProgram(_) | Self::Poison(_) | Self::Cancelled => false,
         }
     }

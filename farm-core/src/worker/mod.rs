@@ -22,7 +22,7 @@ pub struct WorkerConfig {
     pub devices: Vec<DeviceInfo>,
     /// The data plane.
     pub contact: Contact,
-    /// Most jobs held; further ones are refused as failed with `OutOfMemory`.
+    /// Most jobs held, executed and unacknowledged ones too; further ones are given back (`JobFailure::Returned`).
     pub max_jobs: usize,
     /// Gain of the lottery's feedback (10-scheduling.md section 2: c = 0.15).
     pub lottery_gain: f64,
@@ -120,7 +120,8 @@ pub enum Effect {
         /// Where.
         device: DeviceIndex,
     },
-    /// Take a staged or running job back: it need not finish, and `Executed` with `Cancelled` may follow.
+    /// Take a staged or running job back: it need not finish, and `Executed` with `Cancelled` may follow. Its place
+    /// counts as free at once, so the next `Execute` may come while the executor still winds the aborted job up.
     Abort {
         /// Which.
         job: JobAttempt,
