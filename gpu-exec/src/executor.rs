@@ -1,0 +1,199 @@
+//! The executor's interface, the same for real and simulated devices.
+//!
+//! It owns no device itself: it hands orders to [`crate::real`] or [`crate::sim`]. A later executor in a subprocess of
+//! its own is a third variant behind the same four calls.
+
+use std::{sync::Arc, time::Duration};
+
+use bytes::Bytes;
+use farm_core::{
+    device::DeviceInfo,
+    id::{ContentHash, DeviceIndex, JobAttempt},
+    message::JobFailure,
+    program::JobProgram,
+};
+
+use crate::{
+    error::{Busy, OpenError},
+    real::{self, RealDevice},
+    sim::SimDevice,
+    spec::DeviceSpec,
+};
+
+/// The callback that events go to.
+pub(crate) type EventSink = Box<dyn Fn(ExecutorEvent) + Send + Sync>;
+
+/// Most devices of one node: what [`DeviceIndex`] and a status screen can hold.
+pub(crate) const MAX_DEVICES: usize = 256;
+
+/// One job for a device, with everything it needs.
+#[derive(Clone, Debug)]
+pub struct Order {
+    /// Which attempt.
+    pub job: JobAttempt,
+    /// What to do.
+    pub program: Arc<JobProgram>,
+    /// The bytes of every module and task allocation that the program names, in any order. A name that is missing
+    /// here fails the job with [`JobFailure::ContentUnavailable`], unless the device still holds it.
+    pub contents: Vec<(ContentHash, Bytes)>,
+    /// How long the job may run, from `Started`.
+    pub limit: Duration,
+}
+
+/// What an executor reports. Events of one job come in order: at most one `Started`, then one `Finished`.
+#[derive(Clone, Debug, PartialEq)]
+pub enum ExecutorEvent {
+    /// The job began to run; the device has room for a staged one.
+    Started {
+        /// Which.
+        job: JobAttempt,
+    },
+    /// The job ended, in whatever way. Aborted ones end with [`JobFailure::Cancelled`].
+    Finished {
+        /// Which.
+        job: JobAttempt,
+        /// Measured device time in nanoseconds: timestamp queries where the device has them, else wall time of its
+        /// submits. Also charged when the job failed.
+        device_time_ns: u64,
+        /// The result's sections in program order; they are slices of one allocation, one after the other.
+        outcome: Result<Vec<Bytes>, JobFailure>,
+    },
+    /// The device is gone and could not be reopened. Jobs that were on it have been reported before.
+    Lost {
+        /// Why, for people.
+        reason: String,
+    },
+}
+
+/// Settings of an executor. Fractions are of the device's estimated memory.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct ExecutorConfig {
+    /// Compile modules without runtime checks (bounds, loop counters, division by zero). Only with the operator's
+    /// permission: a wrong kernel may then crash the driver or read other jobs' memory.
+    pub unchecked: bool,
+    /// Most memory of cached task allocations that no job uses.
+    pub allocation_cache_fraction: f64,
+    /// Most memory of idle pooled buffers.
+    pub pool_fraction: f64,
+    /// Most parsed modules kept.
+    pub max_modules: usize,
+    /// Most compiled pipelines kept.
+    pub max_pipelines: usize,
+    /// What a submit of work should take at most; sliced launches are cut to it.
+    pub submit_target: Duration,
+}
+
+impl Default for ExecutorConfig {
+    fn default() -> Self {
+        Self {
+            unchecked: false,
+            allocation_cache_fraction: 0.5,
+            pool_fraction: 0.25,
+            max_modules: 64,
+            max_pipelines: 256,
+            // 30-programs-and-data.md section 4: a submit stays below 50 ms; half of it leaves room for variance.
+            submit_target: Duration::from_millis(25),
+        }
+    }
+}
+
+/// A device and what drives it. Dropping it aborts what it holds.
+#[derive(Debug)]
+pub struct Executor {
+    info: DeviceInfo,
+    device: Device,
+}
+
+#[derive(Debug)]
+enum Device {
+    Real(RealDevice),
+    Sim(SimDevice),
+}
+
+impl Executor {
+    /// Opens a device, measures its score and starts its executor.
+    ///
+    /// `on_event` is called from the device's thread (a simulated device: also from inside [`Self::submit`] and
+    /// [`Self::abort`]); it must not block.
+    ///
+    /// # Errors
+    /// There is no such device, it cannot be opened, or `spec` is [`DeviceSpec::All`].
+    pub fn start(
+        spec: &DeviceSpec,
+        config: ExecutorConfig,
+        on_event: impl Fn(ExecutorEvent) + Send + Sync + 'static,
+    ) -> Result<Self, OpenError> {
+        match spec {
+            DeviceSpec::All => Err(OpenError::NotSingle { spec: *spec }),
+            DeviceSpec::Gpu(_) | DeviceSpec::Cpu => {
+                let (device, info) = RealDevice::start(*spec, config, Box::new(on_event))?;
+                Ok(Self { info, device: Device::Real(device) })
+            }
+            DeviceSpec::Sim(sim) => {
+                let (device, info) = SimDevice::start(*sim, Box::new(on_event))?;
+                Ok(Self { info, device: Device::Sim(device) })
+            }
+        }
+    }
+
+    /// The device as its node announces it.
+    #[must_use]
+    pub const fn info(&self) -> &DeviceInfo {
+        &self.info
+    }
+
+    /// Takes an order: it runs at once, or is staged (prepared while the running one runs).
+    ///
+    /// # Errors
+    /// One runs and one is staged already, or the device is lost. The order is dropped.
+    pub fn submit(&self, order: Order) -> Result<(), Busy> {
+        match &self.device {
+            Device::Real(device) => device.submit(order),
+            Device::Sim(device) => device.submit(order),
+        }
+    }
+
+    /// Takes a job back: a staged one ends at once, a running one at its next run boundary, both with
+    /// [`JobFailure::Cancelled`]. Unknown jobs are ignored: they have ended already.
+    pub fn abort(&self, job: JobAttempt) {
+        match &self.device {
+            Device::Real(device) => device.abort(job),
+            Device::Sim(device) => device.abort(job),
+        }
+    }
+}
+
+/// Replaces [`DeviceSpec::All`] by the devices it stands for on this machine.
+///
+/// # Errors
+/// `all` was asked for and there is no Vulkan adapter, or there are more devices than a node may have.
+pub fn expand(specs: &[DeviceSpec]) -> Result<Vec<DeviceSpec>, OpenError> {
+    let mut devices = Vec::with_capacity(specs.len());
+    for spec in specs {
+        match spec {
+            DeviceSpec::All => devices.extend(real::all()?),
+            DeviceSpec::Gpu(_) | DeviceSpec::Cpu | DeviceSpec::Sim(_) => devices.push(*spec),
+        }
+    }
+    if devices.len() > MAX_DEVICES {
+        return Err(OpenError::TooMany { count: devices.len(), most: MAX_DEVICES });
+    }
+    Ok(devices)
+}
+
+/// Opens every device of `specs`, one after the other, `all` expanded; events carry the device's index in the answer.
+///
+/// # Errors
+/// The first device that cannot be opened.
+pub fn open(
+    specs: &[DeviceSpec],
+    config: ExecutorConfig,
+    on_event: impl Fn(DeviceIndex, ExecutorEvent) + Send + Sync + 'static,
+) -> Result<Vec<Executor>, OpenError> {
+    let on_event = Arc::new(on_event);
+    let start = |(index, spec): (u16, &DeviceSpec)| {
+        let on_event = Arc::clone(&on_event);
+        Executor::start(spec, config, move |event| on_event(DeviceIndex(index), event))
+    };
+    (0..).zip(&expand(specs)?).map(start).collect()
+}

@@ -1,0 +1,253 @@
+//! Simulated devices: launches take as long as their cost says, sleep instead of computing, and change no buffer.
+//!
+//! A farm of them is real but for the kernels: 32 in one process cost one timer thread together. Jobs of no cost
+//! complete inside [`SimDevice::submit`], without any thread in between. Host bytes make the round trip: what `MemcpyHtoD`
+//! wrote is what `MemcpyDtoH` reads, everything else reads as zeros.
+
+mod timer;
+
+use std::{
+    collections::VecDeque,
+    fmt,
+    sync::{Arc, Mutex, MutexGuard, PoisonError},
+    time::{Duration, Instant},
+};
+
+use bytes::Bytes;
+use farm_core::{
+    device::{DeviceInfo, DeviceKind, Features, Limits},
+    id::JobAttempt,
+    message::{CostNs, JobFailure},
+    program::{Buffer, Command, JobProgram, ProgramQuota, validate},
+};
+
+use crate::{
+    error::{Busy, OpenError},
+    executor::{EventSink, ExecutorEvent, Order},
+    spec::{DeviceSpec, SimSpec},
+};
+
+/// A simulated device.
+pub(crate) struct SimDevice {
+    shared: Arc<Shared>,
+}
+
+/// What the submitter and the timer thread share. A mutex and not a message: a job of no cost has to complete in the
+/// submitter's own call, and the state is touched for well under a microsecond at a time.
+struct Shared {
+    spec: SimSpec,
+    on_event: EventSink,
+    state: Mutex<State>,
+}
+
+#[derive(Default)]
+struct State {
+    running: Option<Running>,
+    staged: Option<Order>,
+    /// Tells the running job's alarm from those of jobs that were aborted before.
+    generation: u64,
+    /// Events not yet handed out; bounded by two events a held job.
+    outbox: VecDeque<ExecutorEvent>,
+    /// Some thread is handing events out: it takes the new ones too, so that their order holds.
+    emitting: bool,
+}
+
+struct Running {
+    job: JobAttempt,
+    program: Arc<JobProgram>,
+    sections: Vec<u64>,
+    started: Instant,
+    duration: Duration,
+    /// The duration is the order's limit, not the program's cost.
+    cut_short: bool,
+}
+
+impl SimDevice {
+    pub(crate) fn start(spec: SimSpec, on_event: EventSink) -> Result<(Self, DeviceInfo), OpenError> {
+        timer::ensure().map_err(|source| OpenError::Thread { spec: DeviceSpec::Sim(spec), source })?;
+        let info = DeviceInfo {
+            name: format!("simulated (speed {})", spec.speed),
+            kind: DeviceKind::Simulated,
+            score: spec.score,
+            features: Features::INT64
+                .union(Features::FLOAT16)
+                .union(Features::SUBGROUP)
+                .union(Features::TIMESTAMP),
+            limits: Limits::UNBOUNDED,
+        };
+        let shared = Arc::new(Shared { spec, on_event, state: Mutex::default() });
+        Ok((Self { shared }, info))
+    }
+
+    pub(crate) fn submit(&self, order: Order) -> Result<(), Busy> {
+        let mut state = self.shared.lock();
+        if state.running.is_none() {
+            self.shared.begin(&mut state, order);
+        } else if state.staged.is_none() {
+            state.staged = Some(order);
+        } else {
+            return Err(Busy::Full { job: order.job });
+        }
+        self.shared.emit(state);
+        Ok(())
+    }
+
+    pub(crate) fn abort(&self, job: JobAttempt) {
+        let mut state = self.shared.lock();
+        if state.staged.as_ref().is_some_and(|order| order.job == job) {
+            state.staged = None;
+            state.finish(job, 0, Err(JobFailure::Cancelled));
+        } else if let Some(running) = state.running.take_if(|running| running.job == job) {
+            let elapsed = running.started.elapsed().min(running.duration);
+            state.finish(job, nanoseconds(elapsed), Err(JobFailure::Cancelled));
+            self.shared.promote(&mut state);
+        }
+        self.shared.emit(state);
+    }
+}
+
+impl fmt::Debug for SimDevice {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("SimDevice").field("spec", &self.shared.spec).finish_non_exhaustive()
+    }
+}
+
+impl Shared {
+    fn lock(&self) -> MutexGuard<'_, State> {
+        // No callback runs under the lock, so a panic cannot leave the state half changed.
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// The timer's call: the job of `generation` has had its time, if it still runs.
+    fn alarm(self: &Arc<Self>, generation: u64) {
+        let mut state = self.lock();
+        if state.generation != generation {
+            return;
+        }
+        if let Some(running) = state.running.take() {
+            state.complete(running);
+            self.promote(&mut state);
+        }
+        self.emit(state);
+    }
+
+    fn promote(self: &Arc<Self>, state: &mut State) {
+        if let Some(order) = state.staged.take() {
+            self.begin(state, order);
+        }
+    }
+
+    fn begin(self: &Arc<Self>, state: &mut State, order: Order) {
+        let Order { job, program, limit, .. } = order;
+        state.outbox.push_back(ExecutorEvent::Started { job });
+        let summary = match validate(&program, &ProgramQuota::default()) {
+            Ok(summary) => summary,
+            Err(error) => {
+                state.finish(job, 0, Err(JobFailure::InvalidProgram(error.to_string())));
+                return;
+            }
+        };
+        let cost = duration_of(summary.cost, self.spec.speed);
+        let running = Running {
+            job,
+            program,
+            sections: summary.sections,
+            started: Instant::now(),
+            duration: cost.min(limit),
+            cut_short: cost > limit,
+        };
+        if running.duration.is_zero() {
+            state.complete(running);
+            return;
+        }
+        state.generation += 1;
+        timer::wake_at(running.started + running.duration, Arc::downgrade(self), state.generation);
+        state.running = Some(running);
+    }
+
+    /// Hands the outbox out, without the lock while a callback runs: it may submit the next job from inside.
+    fn emit<'a>(&'a self, mut state: MutexGuard<'a, State>) {
+        if state.emitting {
+            return;
+        }
+        state.emitting = true;
+        while let Some(event) = state.outbox.pop_front() {
+            drop(state);
+            (self.on_event)(event);
+            state = self.lock();
+        }
+        state.emitting = false;
+    }
+}
+
+impl State {
+    fn complete(&mut self, running: Running) {
+        let outcome = if running.cut_short {
+            Err(JobFailure::Timeout)
+        } else {
+            Ok(sections(&running.program, &running.sections))
+        };
+        self.finish(running.job, nanoseconds(running.duration), outcome);
+    }
+
+    fn finish(&mut self, job: JobAttempt, device_time_ns: u64, outcome: Result<Vec<Bytes>, JobFailure>) {
+        self.outbox.push_back(ExecutorEvent::Finished { job, device_time_ns, outcome });
+    }
+}
+
+/// How long a launch of `cost` takes at `speed`.
+fn duration_of(cost: CostNs, speed: f64) -> Duration {
+    // A cost is far below 2^53 ns (104 days) where its rounding would be seen.
+    Duration::try_from_secs_f64(cost.0 as f64 / speed / 1e9).unwrap_or(Duration::MAX)
+}
+
+fn nanoseconds(duration: Duration) -> u64 {
+    u64::try_from(duration.as_nanos()).unwrap_or(u64::MAX)
+}
+
+/// What a device without kernels reads back from a valid program: `MemcpyHtoD` bytes over zeros.
+fn sections(program: &JobProgram, lengths: &[u64]) -> Vec<Bytes> {
+    if lengths.is_empty() {
+        return Vec::new();
+    }
+    let bytes_of = |length: u64| usize::try_from(length).expect("a valid program's result fits the quota");
+    let mut payload = vec![0_u8; lengths.iter().copied().map(bytes_of).sum()];
+    let mut start = 0;
+    for (index, command) in program.commands().iter().enumerate() {
+        if let Command::MemcpyDtoH { buffer, offset_bytes, size_bytes } = *command {
+            let end = start + bytes_of(size_bytes);
+            let earlier = &program.commands()[..index];
+            overlay(&mut payload[start..end], earlier, buffer, offset_bytes);
+            start = end;
+        }
+    }
+    let payload = Bytes::from(payload);
+    let mut start = 0;
+    let mut cut = |&length: &u64| {
+        let end = start + bytes_of(length);
+        let section = payload.slice(start..end);
+        start = end;
+        section
+    };
+    lengths.iter().map(&mut cut).collect()
+}
+
+/// Writes what `commands` copied into `wanted` onto the part of it that begins at `part_offset`.
+fn overlay(part: &mut [u8], commands: &[Command], wanted: Buffer, part_offset: u64) {
+    for command in commands {
+        let Command::MemcpyHtoD { buffer, offset_bytes, bytes } = command else { continue };
+        if *buffer != wanted {
+            continue;
+        }
+        let (skip_source, skip_part) =
+            (part_offset.saturating_sub(*offset_bytes), offset_bytes.saturating_sub(part_offset));
+        let (Ok(skip_source), Ok(skip_part)) = (usize::try_from(skip_source), usize::try_from(skip_part))
+        else {
+            continue;
+        };
+        if let (Some(source), Some(target)) = (bytes.get(skip_source..), part.get_mut(skip_part..)) {
+            let count = source.len().min(target.len());
+            target[..count].copy_from_slice(&source[..count]);
+        }
+    }
+}
