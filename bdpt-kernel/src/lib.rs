@@ -3,4 +3,5 @@
 //! programs.
 
 pub mod bvh;
+pub mod gpu;
 pub mod scene;
