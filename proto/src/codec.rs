@@ -207,3 +207,128 @@ fn malformed(what: &'static str, reason: String) -> CodecError {
 fn too_large(what: &'static str, bytes: usize, cap: usize) -> CodecError {
     CodecError::TooLarge { what, bytes: bytes as u64, cap: cap as u64 }
 }
+
+#[cfg(test)]
+mod tests {
+    use farm_core::message::CostNs;
+    use farm_core::program::{Content, JobProgram, Slicing};
+    use proptest::prelude::*;
+
+    use super::*;
+
+    fn program(data: &[u8], launches: u32) -> JobProgram {
+        let mut program = JobProgram::default();
+        let size_bytes = (data.len() as u64).next_multiple_of(4).max(4);
+        let module = Content { hash: content_hash(data), size_bytes };
+        let buffer = program.malloc(size_bytes).unwrap();
+        let input = program.task_allocation(module);
+        let kernel = program.function_with_constants(module, "main", &[("tile", 8.5)]);
+        program.memcpy_htod(kernel, "camera", data).unwrap();
+        program.param_in(kernel, 0, input).unwrap();
+        program.param_in_out(kernel, 1, buffer).unwrap();
+        for launch in 1..=launches {
+            let slicing = Slicing { global: "slice".to_owned(), max_groups_z: launch };
+            program.launch_sliced(kernel, [launch, 1, 2], slicing, CostNs(u64::from(launch) << 40)).unwrap();
+        }
+        program.memcpy_dtoh(buffer, 0, size_bytes).unwrap();
+        program
+    }
+
+    #[test]
+    fn a_digest_names_its_bytes() {
+        assert_eq!(
+            content_hash(b"").to_string(),
+            "af1349b9f5f9a1a6a0404dea36dcc9499bcb25c9adc112b7cc9a93cae41f3262",
+            "blake3 of nothing, from the reference implementation"
+        );
+        assert_ne!(content_hash(b"a"), content_hash(b"b"));
+    }
+
+    #[test]
+    fn a_large_program_keeps_its_bytes() {
+        let large = program(&vec![7; 20 << 20], 3);
+        let encoded = encode_program(&large).unwrap();
+        assert!(encoded.len() < (20 << 20) + 1_000, "{} B: bytes are not encoded one by one", encoded.len());
+        assert!(decode_program(&encoded).unwrap() == large, "20 MiB differ");
+    }
+
+    #[test]
+    fn an_oversized_program_is_refused() {
+        let bytes = vec![0; MAX_PROGRAM_BYTES];
+        let error = encode_program(&program(&bytes, 1)).unwrap_err();
+        assert!(matches!(error, CodecError::TooLarge { .. }), "got {error}");
+        let error = decode_program(&vec![0; MAX_PROGRAM_BYTES + 1]).unwrap_err();
+        assert!(matches!(error, CodecError::TooLarge { .. }), "got {error}");
+    }
+
+    #[test]
+    fn hostile_lengths_are_refused() {
+        // 253 announces a u64 in bincode's variable-length integers: 2^64-1 commands, or bytes, or characters.
+        let all_ones = [&[253_u8][..], &[0xff; 8]].concat();
+        let commands = all_ones.clone();
+        // One command, the fifth (MemcpyHtoD): buffer 0, offset 0, so many bytes.
+        let bytes = [&[1, 4, 0, 0][..], &all_ones].concat();
+        // One command, the third (Function): kernel 0, module (digest, size), so long an entry.
+        let text = [&[1, 2, 0][..], &[0; 32], &[0], &all_ones].concat();
+        // A length that is over the limit for so short an input, but not over the type's cap.
+        let amplified = [&[1, 4, 0, 0, 252][..], &(200_u32 << 20).to_le_bytes()].concat();
+        for (case, input) in
+            [("commands", commands), ("bytes", bytes), ("text", text), ("amplified", amplified)]
+        {
+            let error = decode_program(&input).unwrap_err();
+            assert!(matches!(error, CodecError::Malformed { .. }), "{case}: got {error}");
+        }
+    }
+
+    #[test]
+    fn payloads_of_programs_are_split_where_they_were_joined() {
+        let programs: Vec<Bytes> = [0, 1, 100, PACK_BELOW_BYTES, 5, 3 * PACK_BELOW_BYTES]
+            .map(|length| Bytes::from(vec![u8::try_from(length % 251).unwrap(); length]))
+            .to_vec();
+        let chunks = pack_programs(&programs);
+        assert_eq!(chunks.len(), 4, "the two large ones are not copied");
+        let payload = Bytes::from(chunks.concat());
+        assert_eq!(unpack_programs(payload.clone(), programs.len()).unwrap(), programs);
+        assert_eq!(pack_programs(&[]), Vec::<Bytes>::new());
+        assert_eq!(unpack_programs(Bytes::new(), 0).unwrap(), Vec::<Bytes>::new());
+        for (case, payload, count) in [
+            ("one too few", payload.clone(), programs.len() - 1),
+            ("one too many", payload.clone(), programs.len() + 1),
+            ("an absurd count", payload.clone(), usize::MAX),
+            ("torn", payload.slice(..payload.len() - 1), programs.len()),
+            ("an absurd length", Bytes::from_static(&[0xff; 8]), 1),
+        ] {
+            assert!(unpack_programs(payload, count).is_err(), "{case}");
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn programs_come_back(data in prop::collection::vec(any::<u8>(), 1..2_000), launches in 0_u32..50) {
+            let data = &data[..];
+            let sent = program(data, launches);
+            let encoded = encode_program(&sent).unwrap();
+            prop_assert_eq!(decode_program(&encoded).unwrap(), sent);
+            prop_assert!(decode_program(&encoded[..encoded.len() - 1]).is_err(), "torn");
+            let longer = [&encoded[..], &[0]].concat();
+            prop_assert!(decode_program(&longer).is_err(), "a byte too many");
+        }
+
+        #[test]
+        fn any_bytes_give_an_answer(bytes in prop::collection::vec(any::<u8>(), 0..300)) {
+            // Whatever the answer is, there is one.
+            let _ = decode_program(&bytes);
+            let _ = decode_header::<farm_core::message::AppToNode>(&bytes);
+            let _ = decode_header::<farm_core::message::NodeToApp>(&bytes);
+            let _ = unpack_programs(Bytes::from(bytes), 3);
+        }
+
+        #[test]
+        fn a_flipped_bit_never_panics(at in 0_usize..400, bit in 0_u8..8) {
+            let mut encoded = encode_program(&program(b"some bytes", 3)).unwrap().to_vec();
+            let at = at % encoded.len();
+            encoded[at] ^= 1 << bit;
+            let _ = decode_program(&encoded);
+        }
+    }
+}

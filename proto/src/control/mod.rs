@@ -3,5 +3,6 @@
 mod session;
 
 pub use self::session::{
-    ADMIN_TIMEOUT, Session, SessionError, SessionReceiver, SessionSender, connect_app, connect_node, drain, status,
+    ADMIN_TIMEOUT, Session, SessionError, SessionReceiver, SessionSender, connect_app, connect_node, drain,
+    status,
 };

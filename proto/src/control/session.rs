@@ -102,7 +102,9 @@ impl<R> SessionReceiver<R> {
 ///
 /// # Errors
 /// Nobody answers within [`ADMIN_TIMEOUT`].
-pub async fn connect_app(coordinator: &str) -> Result<Session<AppToCoordinator, CoordinatorToApp>, SessionError> {
+pub async fn connect_app(
+    coordinator: &str,
+) -> Result<Session<AppToCoordinator, CoordinatorToApp>, SessionError> {
     let _ = coordinator;
     unimplemented!()
 }
@@ -111,7 +113,9 @@ pub async fn connect_app(coordinator: &str) -> Result<Session<AppToCoordinator, 
 ///
 /// # Errors
 /// Nobody answers within [`ADMIN_TIMEOUT`].
-pub async fn connect_node(coordinator: &str) -> Result<Session<NodeToCoordinator, CoordinatorToNode>, SessionError> {
+pub async fn connect_node(
+    coordinator: &str,
+) -> Result<Session<NodeToCoordinator, CoordinatorToNode>, SessionError> {
     let _ = coordinator;
     unimplemented!()
 }

@@ -15,6 +15,8 @@ mod connect;
 mod fetch;
 mod receive;
 mod send;
+mod shared;
+mod wire;
 
 use std::{fmt, sync::Arc};
 
@@ -24,8 +26,8 @@ use serde::{Serialize, de::DeserializeOwned};
 use thiserror::Error;
 
 pub use self::{
-    connect::{BindError, CONNECT_TIMEOUT, ConnectError, DataServer, Incoming, connect},
-    fetch::FetchError,
+    connect::{BindError, CONNECT_TIMEOUT, ConnectError, DataServer, Incoming, MAX_LINKS, connect},
+    fetch::{FetchError, STALL_TIMEOUT},
     receive::LinkReceiver,
     send::{LinkSender, TrySendError},
 };
@@ -38,7 +40,7 @@ pub const MAX_PAYLOAD_BYTES: u64 = 1 << 30;
 /// Most bytes of one content (task allocation or module).
 pub const MAX_CONTENT_BYTES: u64 = 16 << 30;
 /// Frames that wait to be sent on one link, and received frames that wait to be read: at most this many each.
-pub const QUEUED_FRAMES: usize = 4_096;
+pub const QUEUED_FRAMES: usize = 1_024;
 /// Large frames on the way at once in one direction of a link.
 pub const BULK_STREAMS: u32 = 8;
 /// Content fetches on the way at once on one link; further ones wait.
@@ -136,3 +138,6 @@ impl From<CodecError> for LinkError {
         Self::Frame { reason: error.to_string() }
     }
 }
+
+#[cfg(test)]
+mod tests;
