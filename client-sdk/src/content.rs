@@ -76,6 +76,11 @@ impl TaskData {
         self.add(wgsl.into())
     }
 
+    /// What was added here.
+    pub(crate) fn added(&self) -> impl Iterator<Item = ContentHash> {
+        self.added.iter().copied()
+    }
+
     fn add(&mut self, bytes: Bytes) -> Content {
         let content =
             Content { hash: ContentHash(*blake3::hash(&bytes).as_bytes()), size_bytes: bytes.len() as u64 };

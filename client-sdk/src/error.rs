@@ -145,6 +145,9 @@ pub enum FarmError {
         /// The panic's text.
         message: String,
     },
+    /// The system gave no thread for a run.
+    #[error("no thread for the run: {0}")]
+    Thread(#[source] std::io::Error),
     /// The run was ended by its stop handle.
     #[error("stopped after {jobs_done} of {jobs_known} jobs")]
     Stopped {
@@ -175,6 +178,7 @@ impl FarmError {
             | Self::UnknownContent { .. }
             | Self::Retrieve { .. }
             | Self::Panicked { .. }
+            | Self::Thread(_)
             | Self::Stopped { .. }
             | Self::Closed => false,
         }
@@ -197,6 +201,7 @@ fn describe_failure(failure: &JobFailure) -> String {
         JobFailure::OutOfMemory(reason) => format!("the device had no memory for it: {reason}"),
         JobFailure::ContentUnavailable(hash) => format!("content {hash} could not be fetched"),
         JobFailure::Poison(reason) => format!("too many attempts ended with their device or node: {reason}"),
+        JobFailure::Returned => "its node gave it back".to_owned(),
         JobFailure::Cancelled => "it was cancelled".to_owned(),
     }
 }

@@ -1,19 +1,46 @@
-//! An application's connection to a farm.
+//! An application's connection to a farm: what the application holds. The work is the driver's and the runs'.
 
-use tokio::sync::watch;
+use std::{
+    sync::{
+        atomic::{AtomicU32, Ordering},
+        mpsc as std_mpsc,
+    },
+    thread,
+};
+
+use proto::{
+    control::{SessionError, connect_app},
+    link::ContentSource,
+};
+use tokio::{
+    sync::{oneshot, watch},
+    task::JoinHandle,
+};
 
 use crate::{
+    content::ContentStore,
+    driver::{DriverHandle, DriverSetup, drive},
     error::FarmError,
     graph::TaskGraph,
     options::FarmOptions,
     progress::{Progress, RunSummary},
+    run::{Run, RunEnd, RunEvent},
 };
 
-/// An application's connection to a farm. Dropping it closes it; [`Self::close`] also waits until goodbye is said.
+/// An application's connection to a farm. Dropping it ends its runs and its registration; [`Self::close`] also waits
+/// until goodbye is said, without which the farm keeps the application's place for a while (its lease).
 #[derive(Debug)]
 pub struct Farm {
-    progress: watch::Receiver<Progress>,
+    options: FarmOptions,
+    driver: DriverHandle,
+    driver_task: JoinHandle<()>,
+    store: ContentStore,
+    /// Task ids are given once in a connection's life: two runs never share one.
+    next_task: AtomicU32,
+    progress: watch::Sender<Progress>,
     stop: watch::Sender<bool>,
+    /// Dropped or used, it lets the driver end.
+    closing: oneshot::Sender<()>,
 }
 
 /// Ends the runs of a farm early and in order; can be cloned and used from any thread.
@@ -23,36 +50,106 @@ pub struct StopHandle {
 }
 
 impl StopHandle {
-    /// Lets every current and later run of the farm end with [`FarmError::Stopped`]: results that have
-    /// arrived are retrieved, everything else is cancelled.
+    /// Lets every current and later run of the farm end with [`FarmError::Stopped`]: results that have arrived are
+    /// retrieved, everything else is cancelled. A `prepare` or `finish` that is on its way is not waited for.
     pub fn stop(&self) {
         self.stop.send_replace(true);
     }
 }
 
 impl Farm {
-    /// Connects to a coordinator and registers the application.
+    /// Connects to a coordinator and registers the application. Must be called on a tokio runtime, which carries the
+    /// connection from then on.
     ///
     /// # Errors
-    /// An option is out of range, the coordinator cannot be reached in time, or it refuses.
+    /// An option is out of range, the coordinator cannot be reached within [`FarmOptions::connect_timeout`] (a refused
+    /// connection is an error at once), or it refuses the application.
     pub async fn connect(options: FarmOptions) -> Result<Self, FarmError> {
         options.check()?;
-        Err(FarmError::Unreachable { address: options.coordinator, reason: "not connected yet".to_owned() })
+        let (address, timeout) = (options.coordinator.clone(), options.connect_timeout);
+        match tokio::time::timeout(timeout, Self::register(options)).await {
+            Ok(outcome) => outcome,
+            Err(_) => {
+                Err(FarmError::Unreachable { address, reason: format!("no answer within {timeout:?}") })
+            }
+        }
     }
 
-    /// Runs a graph of tasks to its end. Several runs may go side by side.
+    async fn register(options: FarmOptions) -> Result<Self, FarmError> {
+        let session =
+            connect_app(&options.coordinator).await.map_err(|error| connect_error(&options, error))?;
+        let (driver, inputs) = DriverHandle::new();
+        let (progress, _) = watch::channel(Progress::default());
+        let (stop, stop_receiver) = watch::channel(false);
+        let (closing, closing_receiver) = oneshot::channel();
+        let (registered, registration) = oneshot::channel();
+        let store = ContentStore::default();
+        let contents = store.clone();
+        let driver_task = tokio::spawn(drive(DriverSetup {
+            options: options.clone(),
+            handle: driver.clone(),
+            inputs,
+            session,
+            registered,
+            contents: ContentSource::new(move |hash| contents.get(&hash)),
+            progress: progress.clone(),
+            stop: stop_receiver,
+            closing: closing_receiver,
+        }));
+        // From here on an early return drops `closing`, and the driver ends.
+        registration.await.unwrap_or(Err(FarmError::Closed))?;
+        Ok(Self {
+            options,
+            driver,
+            driver_task,
+            store,
+            next_task: AtomicU32::new(0),
+            progress,
+            stop,
+            closing,
+        })
+    }
+
+    /// Runs a graph of tasks to its end. Several runs may go side by side; dropping the future ends the run.
     ///
     /// # Errors
     /// See [`FarmError`]; the first cause ends the run, and its outstanding jobs are cancelled.
     pub async fn run(&self, graph: TaskGraph) -> Result<RunSummary, FarmError> {
-        graph.check()?;
-        Err(FarmError::Closed)
+        let nodes = graph.check()?;
+        let count = u32::try_from(nodes.len()).expect("a graph in memory has less than 2^32 tasks");
+        let first = self
+            .next_task
+            .try_update(Ordering::Relaxed, Ordering::Relaxed, |next| next.checked_add(count))
+            .map_err(|_| FarmError::Closed)?;
+        let tasks = first..first + count;
+        let (events_sender, events) = std_mpsc::channel();
+        self.driver.start_run(tasks.clone(), events_sender.clone()).await?;
+        let abandoned = EndWhenDropped(events_sender.clone());
+        let run = Run {
+            tasks: tasks.clone(),
+            nodes,
+            window: self.options.window,
+            store: self.store.clone(),
+            driver: self.driver.clone(),
+            progress: self.progress.clone(),
+            events,
+            events_sender,
+        };
+        let (done, outcome) = oneshot::channel();
+        let code = move || {
+            // Nobody may be waiting any more.
+            let _ = done.send(run.run());
+        };
+        thread::Builder::new().name(format!("gleaner-run-{first}")).spawn(code).map_err(FarmError::Thread)?;
+        let outcome = outcome.await.unwrap_or(Err(FarmError::Closed));
+        drop(abandoned);
+        outcome
     }
 
     /// The newest progress, and a way to wait for the next.
     #[must_use]
     pub fn progress(&self) -> watch::Receiver<Progress> {
-        self.progress.clone()
+        self.progress.subscribe()
     }
 
     /// A handle that ends runs early.
@@ -61,6 +158,32 @@ impl Farm {
         StopHandle { stop: self.stop.clone() }
     }
 
-    /// Says goodbye and waits until it is sent.
-    pub async fn close(self) {}
+    /// Ends what still runs, says goodbye and waits (a few seconds at most) until it is sent.
+    pub async fn close(self) {
+        // The driver may have ended by itself; both ways it is over after this.
+        let _ = self.closing.send(());
+        let _ = self.driver_task.await;
+    }
+}
+
+/// Ends a run that nobody waits for.
+struct EndWhenDropped(std_mpsc::Sender<RunEvent>);
+
+impl Drop for EndWhenDropped {
+    fn drop(&mut self) {
+        // A run that is over does not listen.
+        let _ = self.0.send(RunEvent::Ended(RunEnd::Stopped));
+    }
+}
+
+fn connect_error(options: &FarmOptions, error: SessionError) -> FarmError {
+    let address = options.coordinator.clone();
+    match error {
+        SessionError::Address { reason, .. } => FarmError::Options { option: "coordinator", reason },
+        SessionError::Refused { reason } => FarmError::Refused { address, reason },
+        SessionError::Unreachable { reason, .. } => FarmError::Unreachable { address, reason },
+        error @ (SessionError::Ended { .. } | SessionError::Malformed { .. } | SessionError::Full) => {
+            FarmError::Unreachable { address, reason: error.to_string() }
+        }
+    }
 }

@@ -1,12 +1,14 @@
 //! What an application links: [`Farm`], [`Task`], [`Job`], `dispatch` and `retrieve`.
 
 mod content;
+mod driver;
 mod error;
 mod farm;
 mod graph;
 mod job;
 mod options;
 mod progress;
+mod run;
 mod task;
 
 pub use bytes::Bytes;

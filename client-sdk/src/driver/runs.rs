@@ -1,0 +1,220 @@
+//! The runs that listen: which tasks are whose, what arrived for them, and how long their jobs wait for a device.
+//! It never touches a job.
+
+use std::{
+    collections::BTreeMap,
+    ops::Range,
+    sync::mpsc,
+    time::{Duration, Instant},
+};
+
+use farm_core::{
+    id::{BatchId, JobId, TaskId},
+    message::{Plan, WaitReason},
+};
+
+use crate::run::{Arrival, RunEnd, RunEvent};
+
+pub(super) struct Runs {
+    /// By the first task's id.
+    runs: BTreeMap<u32, Listener>,
+    patience: Duration,
+    waits: BTreeMap<BatchId, Waiting>,
+    stopped: bool,
+}
+
+struct Listener {
+    tasks: Range<u32>,
+    events: mpsc::Sender<RunEvent>,
+    /// Arrived in this turn.
+    arrivals: Vec<Arrival>,
+}
+
+struct Waiting {
+    task: TaskId,
+    reason: WaitReason,
+    since: Instant,
+}
+
+impl Runs {
+    pub(super) const fn new(patience: Duration) -> Self {
+        Self { runs: BTreeMap::new(), patience, waits: BTreeMap::new(), stopped: false }
+    }
+
+    /// Takes a run in; `refused` says why it cannot go on.
+    pub(super) fn start(
+        &mut self,
+        tasks: Range<u32>,
+        events: mpsc::Sender<RunEvent>,
+        refused: Option<RunEnd>,
+    ) {
+        let listener = Listener { tasks, events, arrivals: Vec::new() };
+        match refused {
+            Some(end) => listener.tell(RunEvent::Ended(end)),
+            None if self.stopped => listener.tell(RunEvent::Ended(RunEnd::Stopped)),
+            None => {}
+        }
+        self.runs.insert(listener.tasks.start, listener);
+    }
+
+    pub(super) fn over(&mut self, tasks: &Range<u32>) {
+        self.runs.remove(&tasks.start);
+        self.waits.retain(|_, wait| !tasks.contains(&wait.task.0));
+    }
+
+    pub(super) fn is_running(&self, task: TaskId) -> bool {
+        self.runs.range(..=task.0).next_back().is_some_and(|(_, run)| run.tasks.contains(&task.0))
+    }
+
+    /// Keeps what arrived for the job's run until [`Self::flush`]; a run that is over does not want it.
+    pub(super) fn arrived(&mut self, job: JobId, arrival: Arrival) {
+        let run = self.runs.range_mut(..=job.task.0).next_back().map(|(_, run)| run);
+        if let Some(run) = run.filter(|run| run.tasks.contains(&job.task.0)) {
+            run.arrivals.push(arrival);
+        }
+    }
+
+    /// Hands over what arrived, each run's in one piece.
+    pub(super) fn flush(&mut self) {
+        for run in self.runs.values_mut() {
+            run.flush();
+        }
+    }
+
+    /// A batch waits for a device.
+    pub(super) fn waits(&mut self, batch: BatchId, task: TaskId, reason: WaitReason, now: Instant) {
+        let wait = self.waits.entry(batch).or_insert(Waiting { task, reason, since: now });
+        wait.reason = reason;
+    }
+
+    /// A batch waits no longer.
+    pub(super) fn planned(&mut self, plan: &Plan) {
+        if let Some(batch) = plan.batch {
+            self.waits.remove(&batch);
+        }
+    }
+
+    /// Why jobs wait, if some do.
+    pub(super) fn waiting(&self) -> Option<WaitReason> {
+        self.waits.values().next().map(|wait| wait.reason)
+    }
+
+    pub(super) fn next_wake(&self) -> Option<Instant> {
+        self.waits.values().filter_map(|wait| wait.since.checked_add(self.patience)).min()
+    }
+
+    /// Ends the runs whose patience is at its end.
+    pub(super) fn act_on_timers(&mut self, now: Instant) {
+        let patience = self.patience;
+        let mut tired = Vec::new();
+        self.waits.retain(|_, wait| {
+            let waited = now.saturating_duration_since(wait.since);
+            let waits_on = waited < patience;
+            if !waits_on {
+                tired.push((wait.task, wait.reason, waited));
+            }
+            waits_on
+        });
+        for (task, reason, waited) in tired {
+            let run = self.runs.range_mut(..=task.0).next_back().map(|(_, run)| run);
+            if let Some(run) = run.filter(|run| run.tasks.contains(&task.0)) {
+                run.end(RunEnd::NoFittingDevice { task, reason, waited });
+            }
+        }
+    }
+
+    /// Ends every run, now and later.
+    pub(super) fn stop(&mut self) {
+        self.stopped = true;
+        self.end_all(|| RunEnd::Stopped);
+    }
+
+    pub(super) fn end_all(&mut self, end: impl Fn() -> RunEnd) {
+        for run in self.runs.values_mut() {
+            run.end(end());
+        }
+    }
+}
+
+impl Listener {
+    fn tell(&self, event: RunEvent) {
+        // A run that has ended says so with `RunOver`; until that is heard, what it would get is dropped here.
+        let _ = self.events.send(event);
+    }
+
+    fn flush(&mut self) {
+        if !self.arrivals.is_empty() {
+            let arrivals = std::mem::take(&mut self.arrivals);
+            self.tell(RunEvent::Arrivals(arrivals));
+        }
+    }
+
+    /// What arrived comes before the end.
+    fn end(&mut self, end: RunEnd) {
+        self.flush();
+        self.tell(RunEvent::Ended(end));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use farm_core::{id::AppId, id::JobIndex, message::JobFailure};
+
+    use super::*;
+
+    fn failed(task: u32) -> (JobId, Arrival) {
+        let job = JobId { app: AppId(1), task: TaskId(task), index: JobIndex(0) };
+        (job, Arrival::Failed { job, failure: JobFailure::Timeout })
+    }
+
+    #[test]
+    fn arrivals_go_to_their_run_before_its_end() {
+        let mut runs = Runs::new(Duration::from_secs(60));
+        let (first, first_events) = mpsc::channel();
+        let (second, second_events) = mpsc::channel();
+        runs.start(0..2, first, None);
+        runs.start(2..3, second, None);
+        assert!(runs.is_running(TaskId(1)) && runs.is_running(TaskId(2)) && !runs.is_running(TaskId(3)));
+        for task in [2, 0, 1, 3] {
+            let (job, arrival) = failed(task);
+            runs.arrived(job, arrival);
+        }
+        runs.stop();
+        assert!(matches!(first_events.try_recv(), Ok(RunEvent::Arrivals(arrivals)) if arrivals.len() == 2));
+        assert!(matches!(first_events.try_recv(), Ok(RunEvent::Ended(RunEnd::Stopped))));
+        assert!(matches!(second_events.try_recv(), Ok(RunEvent::Arrivals(arrivals)) if arrivals.len() == 1));
+        let (late, late_events) = mpsc::channel();
+        runs.start(3..4, late, None);
+        assert!(
+            matches!(late_events.try_recv(), Ok(RunEvent::Ended(RunEnd::Stopped))),
+            "stopped stays stopped"
+        );
+    }
+
+    #[test]
+    fn patience_ends_only_what_still_waits() {
+        let mut runs = Runs::new(Duration::from_secs(60));
+        let (sender, events) = mpsc::channel();
+        runs.start(0..2, sender, None);
+        let start = Instant::now();
+        assert_eq!(runs.next_wake(), None);
+        runs.waits(BatchId(1), TaskId(0), WaitReason::NoNode, start);
+        runs.waits(BatchId(2), TaskId(1), WaitReason::NoNode, start);
+        runs.waits(BatchId(2), TaskId(1), WaitReason::NoFittingDevice, start + Duration::from_secs(30));
+        runs.planned(&Plan { batch: Some(BatchId(1)), nodes: Vec::new() });
+        assert_eq!(runs.waiting(), Some(WaitReason::NoFittingDevice));
+        assert_eq!(
+            runs.next_wake(),
+            Some(start + Duration::from_secs(60)),
+            "the wait began with the first word of it"
+        );
+        runs.act_on_timers(start + Duration::from_secs(59));
+        assert!(events.try_recv().is_err());
+        runs.act_on_timers(start + Duration::from_secs(60));
+        let Ok(RunEvent::Ended(RunEnd::NoFittingDevice { task, reason, .. })) = events.try_recv() else {
+            panic!("the run must end")
+        };
+        assert_eq!((task, reason), (TaskId(1), WaitReason::NoFittingDevice));
+        assert_eq!(runs.waiting(), None);
+    }
+}
