@@ -8,7 +8,7 @@ use glam::Vec3A;
 use obvhs::{
     Boundable, BvhBuildParams,
     aabb::Aabb,
-    bvh2::reinsertion::ReinsertionOptimizer,
+    bvh2::{Bvh2, node::Bvh2Node, reinsertion::ReinsertionOptimizer},
     cwbvh::{CwBvh, bvh2_to_cwbvh::bvh2_to_cwbvh},
     ploc::{PlocBuilder, SortPrecision},
 };
@@ -17,6 +17,16 @@ use crate::scene::model::Triangle;
 
 /// Most triangles in one leaf; the node layout holds no more.
 const MAX_TRIANGLES_PER_LEAF: u32 = 3;
+
+/// Most levels of eight-wide nodes: what a traversal's stack holds. Real scenes have about 15.
+pub const MAX_DEPTH: u32 = 32;
+
+/// Most levels of the binary hierarchy before it is compressed, which recurses. PLOC gives about 60 for real scenes.
+const MAX_BINARY_DEPTH: u32 = 1_024;
+
+/// Most triangles with one centroid, at 2^-20 of the scene, that PLOC gets. Coincident boxes pair up one at a time:
+/// quadratic time and a chain for a tree. Real scenes pile up a few.
+const MAX_TRIANGLES_PER_CELL: usize = 1_000;
 
 /// How much work goes into a hierarchy. The image does not depend on it, only the speed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -77,19 +87,28 @@ impl Bvh {
         let parameters = quality.parameters();
         let boxes: Vec<Bounds> = triangles.iter().map(Bounds::of).collect();
         let count = u32::try_from(boxes.len()).expect("the loader bounds triangles far below 2^32");
-        let mut bvh2 = PlocBuilder::with_capacity(boxes.len()).build(
-            parameters.ploc_search_distance,
-            &boxes,
-            (0..count).collect(),
-            parameters.sort_precision,
-            parameters.search_depth_threshold,
-        );
-        if parameters.reinsertion_batch_ratio > 0.0 {
+        let bvh2 = if most_in_one_cell(&boxes) > MAX_TRIANGLES_PER_CELL {
+            median_split(&boxes)
+        } else {
+            let mut bvh2 = PlocBuilder::with_capacity(boxes.len()).build(
+                parameters.ploc_search_distance,
+                &boxes,
+                (0..count).collect(),
+                parameters.sort_precision,
+                parameters.search_depth_threshold,
+            );
             ReinsertionOptimizer::default().run(&mut bvh2, parameters.reinsertion_batch_ratio, None);
-        }
+            if binary_depth_of(&bvh2) > MAX_BINARY_DEPTH { median_split(&boxes) } else { bvh2 }
+        };
         let leaf = parameters.max_prims_per_leaf.clamp(1, MAX_TRIANGLES_PER_LEAF);
         let cwbvh = bvh2_to_cwbvh(&bvh2, leaf, true, false);
         let depth = depth_of(&cwbvh);
+        if depth <= MAX_DEPTH {
+            return Self { cwbvh, depth, build_time: start.elapsed() };
+        }
+        let cwbvh = bvh2_to_cwbvh(&median_split(&boxes), leaf, true, false);
+        let depth = depth_of(&cwbvh);
+        assert!(depth <= MAX_DEPTH, "halving 2^32 triangles takes 32 levels, not {depth}");
         Self { cwbvh, depth, build_time: start.elapsed() }
     }
 }
@@ -107,6 +126,62 @@ impl Boundable for Bounds {
     fn aabb(&self) -> Aabb {
         self.0
     }
+}
+
+/// How many boxes share a centroid, to 2^-20 of the scene's extent.
+fn most_in_one_cell(boxes: &[Bounds]) -> usize {
+    let scene = boxes.iter().fold(Aabb::empty(), |scene, bounds| scene.union(&bounds.0));
+    let scale =
+        Vec3A::splat(1_048_576.0) / (scene.max - scene.min).max(Vec3A::splat(f32::MIN_POSITIVE * 1e9));
+    let mut cells: Vec<[u32; 3]> =
+        boxes.iter().map(|bounds| ((bounds.0.center() - scene.min) * scale).as_uvec3().to_array()).collect();
+    cells.sort_unstable();
+    cells.chunk_by(|a, b| a == b).map(<[_]>::len).max().unwrap_or(0)
+}
+
+/// Halves the triangles at the median of the widest axis of their centroids: at most 32 levels, whatever the input.
+/// The way out for piles of coincident triangles, where no order is better than another.
+fn median_split(boxes: &[Bounds]) -> Bvh2 {
+    let mut order: Vec<u32> = (0..).take(boxes.len()).collect();
+    let mut nodes = vec![Bvh2Node::default()];
+    let mut open = vec![(0_usize, 0_usize, boxes.len())];
+    let at = |index: u32| &boxes[index as usize].0;
+    let position = |index: usize| u32::try_from(index).expect("fewer than 2^32 nodes and triangles");
+    while let Some((node, start, end)) = open.pop() {
+        let part = &mut order[start..end];
+        let bounds = part.iter().fold(Aabb::empty(), |bounds, &index| bounds.union(at(index)));
+        if let [_] = part {
+            nodes[node] = Bvh2Node::new(bounds, 1, position(start));
+            continue;
+        }
+        let centroids = part
+            .iter()
+            .fold(Aabb::empty(), |bounds, &index| bounds.union(&Aabb::from_point(at(index).center())));
+        let extent = centroids.max - centroids.min;
+        let axis = (0..3).max_by(|&a, &b| extent[a].total_cmp(&extent[b])).expect("three axes");
+        let middle = part.len() / 2;
+        part.select_nth_unstable_by(middle, |&a, &b| at(a).center()[axis].total_cmp(&at(b).center()[axis]));
+        let children = nodes.len();
+        nodes[node] = Bvh2Node::new(bounds, 0, position(children));
+        nodes.extend([Bvh2Node::default(); 2]);
+        open.push((children, start, start + middle));
+        open.push((children + 1, start + middle, end));
+    }
+    Bvh2 { nodes, primitive_indices: order, ..Bvh2::default() }
+}
+
+/// Levels of a binary hierarchy.
+fn binary_depth_of(bvh2: &Bvh2) -> u32 {
+    let mut deepest = 0;
+    let mut open = vec![(0_u32, 1_u32)];
+    while let Some((index, depth)) = open.pop() {
+        deepest = deepest.max(depth);
+        let node = &bvh2.nodes[index as usize];
+        if !node.is_leaf() {
+            open.extend([(node.first_index, depth + 1), (node.first_index + 1, depth + 1)]);
+        }
+    }
+    deepest
 }
 
 /// Levels of nodes under and with the root.
@@ -184,7 +259,9 @@ mod tests {
                     })
                     .fold(f32::INFINITY, f32::min);
                 match first_hit(&bvh, &triangles, ray) {
-                    Some((_, t)) => assert!((t - brute).abs() <= 1e-5 * t, "{quality:?} ray {step}: {t} != {brute}"),
+                    Some((_, t)) => {
+                        assert!((t - brute).abs() <= 1e-5 * t, "{quality:?} ray {step}: {t} != {brute}")
+                    }
                     None => assert!(brute.is_infinite(), "{quality:?} ray {step}: missed a hit at {brute}"),
                 }
             }
@@ -199,10 +276,11 @@ mod tests {
         assert_eq!((bvh.depth, bvh.cwbvh.nodes.len()), (1, 1), "one triangle is one node");
         let ray = Ray::new_inf(Vec3A::new(0.2, 0.2, 1.0), Vec3A::NEG_Z);
         assert!(first_hit(&bvh, &[one], ray).is_some(), "the one triangle is hit");
-        let many = vec![one; 5_000];
-        for quality in [BuildQuality::Fast, BuildQuality::Medium, BuildQuality::High] {
-            let bvh = Bvh::build(&many, quality);
-            assert!(bvh.depth <= 32, "{quality:?}: 5,000 coincident triangles give {} levels", bvh.depth);
+        for count in [900, 100_000] {
+            let bvh = Bvh::build(&vec![one; count], BuildQuality::Medium);
+            assert!(bvh.depth <= MAX_DEPTH, "{count} coincident triangles give {} levels", bvh.depth);
+            assert_eq!(bvh.cwbvh.primitive_indices.len(), count, "each triangle lies in one leaf");
+            assert!(first_hit(&bvh, &[one; 1].repeat(count), ray).is_some(), "the pile is hit");
         }
     }
 }

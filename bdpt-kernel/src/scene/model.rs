@@ -1,6 +1,7 @@
 //! A scene after loading: checked, complete, in world units. What the loader yields and what packing and the CPU twins read.
 
 use glam::Vec3;
+use thiserror::Error;
 
 /// Image size in pixels, both > 0.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -9,6 +10,56 @@ pub struct FilmSize {
     pub width_px: u32,
     /// Rows.
     pub height_px: u32,
+}
+
+/// An image size that cannot be rendered.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Error)]
+pub enum FilmSizeError {
+    /// An edge is zero or too long.
+    #[error("image size {width_px}x{height_px}: each edge must be in 1..{} pixels", FilmSize::MAX_EDGE_PX)]
+    Edge {
+        /// Columns asked for.
+        width_px: u32,
+        /// Rows asked for.
+        height_px: u32,
+    },
+    /// Too many pixels together.
+    #[error("image size {width_px}x{height_px}: more than {} pixels", FilmSize::MAX_PIXELS)]
+    Area {
+        /// Columns asked for.
+        width_px: u32,
+        /// Rows asked for.
+        height_px: u32,
+    },
+}
+
+impl FilmSize {
+    /// Longest edge of an image.
+    pub const MAX_EDGE_PX: u32 = 16_384;
+    /// Most pixels of an image: its layers take some 100 B a pixel.
+    pub const MAX_PIXELS: u64 = 1 << 26;
+
+    /// A checked size.
+    ///
+    /// # Errors
+    /// An edge is zero or longer than [`Self::MAX_EDGE_PX`], or the area exceeds [`Self::MAX_PIXELS`].
+    pub const fn new(width_px: u32, height_px: u32) -> Result<Self, FilmSizeError> {
+        let size = Self { width_px, height_px };
+        if width_px == 0 || height_px == 0 || width_px > Self::MAX_EDGE_PX || height_px > Self::MAX_EDGE_PX {
+            return Err(FilmSizeError::Edge { width_px, height_px });
+        }
+        if size.pixels() > Self::MAX_PIXELS {
+            return Err(FilmSizeError::Area { width_px, height_px });
+        }
+        Ok(size)
+    }
+
+    /// Columns times rows.
+    #[must_use]
+    pub const fn pixels(self) -> u64 {
+        // Lossless: u64::from is not const.
+        self.width_px as u64 * self.height_px as u64
+    }
 }
 
 /// A pinhole camera.
