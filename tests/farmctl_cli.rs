@@ -38,8 +38,10 @@ fn an_unreachable_coordinator_is_exit_code_3_and_named() {
 #[test]
 fn a_worker_without_coordinator_is_exit_code_3_and_names_it() {
     let address = dead_address();
-    let worker =
-        Process::start("farm-worker", ["--coordinator", &address, "--device", "sim", "--connect-timeout", "1s"]);
+    let worker = Process::start(
+        "farm-worker",
+        ["--coordinator", &address, "--device", "sim", "--connect-timeout", "1s"],
+    );
     let (status, stderr) = worker.finish();
     assert_eq!(status.code(), Some(3), "{stderr}");
     assert!(stderr.contains(&address), "{stderr}");
@@ -89,7 +91,11 @@ fn bad_renders_name_the_place_and_leave_no_image() {
             write("light", &toml("").replace("[environment]\nradiance = [1, 1, 1]\n", ""), triangle),
             vec!["light"],
         ),
-        ("size", write("size", &toml("").replace("width = 8", "width = 0"), triangle), vec!["scene.toml", "width"]),
+        (
+            "size",
+            write("size", &toml("").replace("width = 8", "width = 0"), triangle),
+            vec!["scene.toml", "width"],
+        ),
     ];
     for (name, scene, places) in cases {
         let image = path(&format!("{name}.png"));
@@ -117,11 +123,12 @@ fn an_unwritable_output_is_refused_before_rendering() {
 
 #[test]
 fn wrong_usage_is_exit_code_2() {
-    for arguments in
-        [vec!["fly-to-the-moon"], vec!["render"], vec!["render", "x", "-o", "x.png", "--size", "0x0"], vec![
-            "render", "x", "-o", "x.bmp",
-        ]]
-    {
+    for arguments in [
+        vec!["fly-to-the-moon"],
+        vec!["render"],
+        vec!["render", "x", "-o", "x.png", "--size", "0x0"],
+        vec!["render", "x", "-o", "x.bmp"],
+    ] {
         let output = farmctl(&arguments);
         assert_eq!(output.status.code(), Some(2), "{arguments:?}: {}", text(&output.stderr));
     }

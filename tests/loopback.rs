@@ -29,7 +29,9 @@ fn finish_render(render: Process, image: &Path) -> Vec<u8> {
 }
 
 fn wait_until_jobs_done(render: &mut Process, jobs: u64) {
-    render.wait_for(|line| line["event"] == "progress" && line["jobs_done"].as_u64().is_some_and(|done| done >= jobs));
+    render.wait_for(|line| {
+        line["event"] == "progress" && line["jobs_done"].as_u64().is_some_and(|done| done >= jobs)
+    });
 }
 
 #[test]

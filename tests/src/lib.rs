@@ -90,10 +90,12 @@ impl Process {
     /// No line came in time, or it is not JSON; the message holds the child's stderr.
     pub fn next_json(&mut self) -> Value {
         match self.lines.recv_timeout(LINE_PATIENCE) {
-            Ok(line) => serde_json::from_str(&line).unwrap_or_else(|error| panic!("{}: {error} in {line:?}", self.name)),
+            Ok(line) => serde_json::from_str(&line)
+                .unwrap_or_else(|error| panic!("{}: {error} in {line:?}", self.name)),
             Err(reason) => {
                 let _ = self.child.kill();
-                panic!("{}: no line on stdout ({reason}); stderr:\n{}", self.name, self.take_stderr());
+                let stderr = self.take_stderr();
+                panic!("{}: no line on stdout ({reason}); stderr:\n{stderr}", self.name);
             }
         }
     }
@@ -141,7 +143,8 @@ impl Process {
                 Err(mpsc::RecvTimeoutError::Disconnected) => break,
                 Err(mpsc::RecvTimeoutError::Timeout) => {
                     let _ = self.child.kill();
-                    panic!("{} did not end in time; stderr:\n{}", self.name, self.take_stderr());
+                    let stderr = self.take_stderr();
+                    panic!("{} did not end in time; stderr:\n{stderr}", self.name);
                 }
             }
         }
