@@ -116,6 +116,9 @@ impl Farm {
     /// See [`FarmError`]; the first cause ends the run, and its outstanding jobs are cancelled.
     pub async fn run(&self, graph: TaskGraph) -> Result<RunSummary, FarmError> {
         let nodes = graph.check()?;
+        if nodes.is_empty() {
+            return Ok(RunSummary::default());
+        }
         let count = u32::try_from(nodes.len()).expect("a graph in memory has less than 2^32 tasks");
         let first = self
             .next_task
@@ -140,7 +143,10 @@ impl Farm {
             // Nobody may be waiting any more.
             let _ = done.send(run.run());
         };
-        thread::Builder::new().name(format!("gleaner-run-{first}")).spawn(code).map_err(FarmError::Thread)?;
+        if let Err(error) = thread::Builder::new().name(format!("gleaner-run-{first}")).spawn(code) {
+            self.driver.abandon_run(tasks).await;
+            return Err(FarmError::Thread(error));
+        }
         let outcome = outcome.await.unwrap_or(Err(FarmError::Closed));
         drop(abandoned);
         outcome

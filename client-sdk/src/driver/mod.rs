@@ -105,6 +105,12 @@ impl DriverHandle {
         self.inputs.send(Input::RunStarted { tasks, events }).await.map_err(|_| FarmError::Closed)
     }
 
+    /// From an async task: takes the announcement back.
+    pub(crate) async fn abandon_run(&self, tasks: Range<u32>) {
+        // Without a driver there is nothing left to tell.
+        let _ = self.inputs.send(Input::RunOver { tasks }).await;
+    }
+
     /// From a thread: submits a batch.
     pub(crate) fn submit(&self, submission: Submission) -> Result<(), FarmError> {
         self.inputs.blocking_send(Input::Submitted(submission)).map_err(|_| FarmError::Closed)

@@ -13,7 +13,10 @@ use farm_core::{
     message::{Plan, WaitReason},
 };
 
-use crate::run::{Arrival, RunEnd, RunEvent};
+use crate::{
+    error::FarmError,
+    run::{Arrival, RunEnd, RunEvent},
+};
 
 pub(super) struct Runs {
     /// By the first task's id.
@@ -156,6 +159,13 @@ impl Listener {
     }
 }
 
+impl Drop for Listener {
+    /// An owner task that ends without a word (a panic, a runtime shut down) must not leave a run waiting.
+    fn drop(&mut self) {
+        self.end(RunEnd::Farm(FarmError::Closed));
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use farm_core::{id::AppId, id::JobIndex, message::JobFailure};
@@ -216,5 +226,7 @@ mod tests {
         };
         assert_eq!((task, reason), (TaskId(1), WaitReason::NoFittingDevice));
         assert_eq!(runs.waiting(), None);
+        drop(runs);
+        assert!(matches!(events.try_recv(), Ok(RunEvent::Ended(RunEnd::Farm(FarmError::Closed)))));
     }
 }

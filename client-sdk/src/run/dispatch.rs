@@ -78,7 +78,7 @@ pub(super) fn dispatch_chunk(
 ) -> Result<DispatchedChunk, (usize, DispatchFault)> {
     let started = Instant::now();
     let dispatched = match threads_for(jobs.len(), time_each) {
-        1 => dispatch_in_order(jobs, known).map_err(|(at, fault)| (at, fault))?,
+        1 => dispatch_in_order(jobs, known)?,
         threads => dispatch_side_by_side(jobs, known, threads)?,
     };
     let count = u32::try_from(jobs.len()).unwrap_or(u32::MAX).max(1);

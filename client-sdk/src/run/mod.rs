@@ -2,6 +2,8 @@
 //! with the first cause. It never touches a socket: batches go to the driver, results come back as events.
 
 mod dispatch;
+#[cfg(test)]
+mod tests;
 mod window;
 
 use std::{
@@ -33,7 +35,7 @@ use crate::{
     job::{Job, JobResult},
     options::Window,
     progress::{Progress, RunSummary, TaskSummary},
-    task::{Task, TaskProgress},
+    task::{Task, TaskError, TaskProgress},
 };
 
 /// Most jobs that are dispatched without a look at what came in.
@@ -44,6 +46,9 @@ const BATCH_JOBS: usize = 4_096;
 const BATCH_BYTES: usize = 16 << 20;
 /// Most events handled before the window is looked at again.
 const EVENTS_PER_TURN: usize = 256;
+
+const PREPARE: &str = "prepare";
+const FINISH: &str = "finish";
 
 /// What a run hears. Sent over an unbounded channel whose content is bounded by the window: at most one
 /// [`Arrival`] for each outstanding job, one `Returned` for each task, and one `Ended`.
@@ -234,7 +239,7 @@ impl Runner {
             }
             if matches!(self.states[at].stage, Stage::Ready) {
                 let data = TaskData::new(self.store.clone());
-                self.send_away(at, "prepare", move |task, name| prepare(task, name, data))?;
+                self.send_away(at, PREPARE, move |task, name| prepare(task, name, data))?;
             }
         }
         Ok(())
@@ -256,15 +261,14 @@ impl Runner {
             let _ = events.send(RunEvent::Returned(Box::new(Returned { at, task, outcome })));
         };
         thread::Builder::new().name(format!("gleaner-{stage}")).spawn(code).map_err(|error| {
-            FarmError::Task {
-                task: state.name.to_string(),
-                stage,
-                error: crate::task::TaskError::application(error),
-            }
+            FarmError::Task { task: state.name.to_string(), stage, error: TaskError::application(error) }
         })?;
+        if stage == PREPARE {
+            let name = Arc::clone(&state.name);
+            self.progress.send_modify(|progress| progress.active_tasks.push(name));
+        }
         state.stage = Stage::Away;
         self.away += 1;
-        self.publish_active_tasks();
         Ok(())
     }
 
@@ -289,6 +293,7 @@ impl Runner {
             }
             stage => {
                 self.states[at].stage = stage;
+                self.no_longer_active(at..at + 1);
                 for dependent in self.states[at].dependents.clone() {
                     let state = &mut self.states[dependent];
                     state.waits_for -= 1;
@@ -296,7 +301,6 @@ impl Runner {
                         state.stage = Stage::Ready;
                     }
                 }
-                self.publish_active_tasks();
             }
         }
         Ok(())
@@ -397,7 +401,7 @@ impl Runner {
                 Stage::Waiting | Stage::Ready | Stage::Away | Stage::Prepared { .. } | Stage::Done => false,
             };
             if idle {
-                self.send_away(at, "finish", finish)?;
+                self.send_away(at, FINISH, finish)?;
             }
         }
         Ok(())
@@ -407,19 +411,10 @@ impl Runner {
         let mut next = match wait {
             // The driver holds the other end until the run is over; without it there is no farm.
             Wait::ForOne => Some(self.events.recv().map_err(|_| FarmError::Closed)?),
-            Wait::No => self.events.try_recv().ok(),
+            Wait::No => None,
         };
         for _ in 0..EVENTS_PER_TURN {
-            match next {
-                None => break,
-                Some(RunEvent::Arrivals(arrivals)) => self.handle_arrivals(arrivals)?,
-                Some(RunEvent::Returned(returned)) => self.returned(*returned)?,
-                Some(RunEvent::Ended(end)) => return Err(self.ended(end)),
-            }
-            next = self.events.try_recv().ok();
-        }
-        if let Some(event) = next {
-            // One event too many was taken out: it is handled now, so that the order stays.
+            let Some(event) = next.take().or_else(|| self.events.try_recv().ok()) else { break };
             match event {
                 RunEvent::Arrivals(arrivals) => self.handle_arrivals(arrivals)?,
                 RunEvent::Returned(returned) => self.returned(*returned)?,
@@ -501,18 +496,18 @@ impl Runner {
         }
     }
 
-    fn publish_active_tasks(&self) {
-        let active = |state: &&TaskState| {
-            matches!(state.stage, Stage::Away | Stage::Prepared { .. } | Stage::Active(_))
-        };
-        let names: Vec<Arc<str>> =
-            self.states.iter().filter(active).map(|state| Arc::clone(&state.name)).collect();
-        self.progress.send_modify(|progress| progress.active_tasks = names);
+    /// Takes names out of the progress; other runs may have tasks of the same names, but not the same allocations.
+    fn no_longer_active(&self, tasks: Range<usize>) {
+        let states = &self.states[tasks];
+        self.progress.send_modify(|progress| {
+            progress.active_tasks.retain(|name| !states.iter().any(|state| Arc::ptr_eq(&state.name, name)));
+        });
     }
 }
 
 impl Drop for Runner {
     fn drop(&mut self) {
+        self.no_longer_active(0..self.states.len());
         self.driver.run_over(self.tasks.clone());
     }
 }
@@ -571,18 +566,18 @@ fn prepare(task: &mut dyn Task, name: &str, mut data: TaskData) -> Result<Stage,
         task.prepare(&mut data)?;
         Ok((task.requirements(), task.jobs()))
     });
-    let (needs, jobs) = application_outcome(outcome, name, "prepare")?;
+    let (needs, jobs) = application_outcome(outcome, name, PREPARE)?;
     Ok(Stage::Prepared { data, needs, jobs, took: started.elapsed() })
 }
 
 /// On a thread of its own: the task's end.
 fn finish(task: &mut dyn Task, name: &str) -> Result<Stage, FarmError> {
-    application_outcome(catch_panic(|| task.finish()), name, "finish")?;
+    application_outcome(catch_panic(|| task.finish()), name, FINISH)?;
     Ok(Stage::Done)
 }
 
 fn application_outcome<T>(
-    outcome: Result<Result<T, crate::task::TaskError>, String>,
+    outcome: Result<Result<T, TaskError>, String>,
     name: &str,
     stage: &'static str,
 ) -> Result<T, FarmError> {
