@@ -8,7 +8,7 @@
 
 use std::{
     process::ExitCode,
-    sync::{Arc, Mutex, OnceLock},
+    sync::{Arc, Mutex},
 };
 
 use client_sdk::{
@@ -43,13 +43,14 @@ const JOB_BYTES: u64 = JOB_FLOATS as u64 * 4;
 struct AddVectors {
     a: Vec<f32>,
     b: Vec<f32>,
-    /// What every job of the task needs, known once `prepare` has run. Jobs share it.
-    shared: Arc<OnceLock<Shared>>,
+    /// What every job of the task names; known once `prepare` has run.
+    shared: Option<Shared>,
     /// Where jobs put their part of the sum.
     sum: Arc<Mutex<Vec<f32>>>,
 }
 
 /// Names of the data that the workers fetch once and keep.
+#[derive(Clone, Copy)]
 struct Shared {
     module: Content,
     a: Content,
@@ -59,18 +60,18 @@ impl Task for AddVectors {
     // Before the first job: name the data that all jobs share. Nothing is sent yet; each worker that gets a job asks for
     // what it lacks, once, and keeps it.
     fn prepare(&mut self, data: &mut TaskData) -> Result<(), TaskError> {
-        let shared = Shared {
+        self.shared = Some(Shared {
             module: data.module(ADD),              // a module: WGSL text
             a: data.allocation(to_bytes(&self.a)), // a task allocation: the whole first vector
-        };
-        self.shared.set(shared).map_err(|_| TaskError::application("prepared twice"))
+        });
+        Ok(())
     }
 
     // The jobs, independent of each other. Only a window of them is in flight at a time.
     fn jobs(&mut self) -> Vec<Box<dyn Job>> {
+        let shared = self.shared.expect("prepare comes first");
         let job = |(number, b): (usize, &[f32])| {
-            let (shared, sum) = (Arc::clone(&self.shared), Arc::clone(&self.sum));
-            Box::new(AddPart { number, b: b.to_vec(), shared, sum }) as Box<dyn Job>
+            Box::new(AddPart { number, b: b.to_vec(), shared, sum: Arc::clone(&self.sum) }) as Box<dyn Job>
         };
         self.b.chunks_exact(JOB_FLOATS).enumerate().map(job).collect()
     }
@@ -80,20 +81,18 @@ impl Task for AddVectors {
 struct AddPart {
     number: usize,
     b: Vec<f32>,
-    shared: Arc<OnceLock<Shared>>,
+    shared: Shared,
     sum: Arc<Mutex<Vec<f32>>>,
 }
 
 impl Job for AddPart {
     // Writes down what the device shall do. Nothing runs here: the program is sent to a worker and replayed there.
     fn dispatch(&mut self, cmd: &mut JobProgram) -> Result<(), DispatchError> {
-        let shared = self.shared.get().ok_or(DispatchError::Application("not prepared".to_owned()))?;
-
         // The kernel: entry point `add` of the module.
-        let add = cmd.function(shared.module, "add");
+        let add = cmd.function(self.shared.module, "add");
 
         // The task allocation, bound by the part that this job adds. Offsets of parts are multiples of 256.
-        let a = cmd.task_allocation(shared.a);
+        let a = cmd.task_allocation(self.shared.a);
         cmd.param(add, 0, a, self.number as u64 * JOB_BYTES, JOB_BYTES, Access::In)?;
 
         // A job allocation with this job's own data: it travels with the program and is freed with the job.
@@ -137,7 +136,7 @@ async fn add_on_farm(coordinator: &str) -> Result<Outcome, FarmError> {
 
     // Register at the coordinator under a name that people see in the farm's status.
     let farm = Farm::connect(FarmOptions::new(coordinator, "vector_add")).await?;
-    let task = AddVectors { a, b, shared: Arc::default(), sum: Arc::clone(&sum) };
+    let task = AddVectors { a, b, shared: None, sum: Arc::clone(&sum) };
     let summary = farm.run(TaskGraph::new().task("add", task)).await?;
     // Say goodbye, so that the farm frees what it holds for us at once.
     farm.close().await;
