@@ -360,6 +360,9 @@ impl Driver {
         while let Some(effect) = self.ledger.poll_effect() {
             match effect {
                 Effect::ToCoordinator(message) => {
+                    if let AppToCoordinator::Plan(request) = &message {
+                        self.runs.asked(request);
+                    }
                     if let Err(error) = self.coordinator.send(message) {
                         self.coordinator_lost(error);
                     }

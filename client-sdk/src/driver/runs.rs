@@ -3,14 +3,14 @@
 
 use std::{
     collections::BTreeMap,
-    ops::Range,
+    ops::{Range, RangeInclusive},
     sync::mpsc,
     time::{Duration, Instant},
 };
 
 use farm_core::{
     id::{BatchId, JobId, TaskId},
-    message::{Plan, WaitReason},
+    message::{Plan, PlanRequest, WaitReason},
 };
 
 use crate::{
@@ -22,6 +22,8 @@ pub(super) struct Runs {
     /// By the first task's id.
     runs: BTreeMap<u32, Listener>,
     patience: Duration,
+    /// Which jobs were asked for together, first and last index: a plan that comes unasked names jobs, not batches.
+    batches: BTreeMap<BatchId, (TaskId, RangeInclusive<u32>)>,
     waits: BTreeMap<BatchId, Waiting>,
     stopped: bool,
 }
@@ -41,7 +43,13 @@ struct Waiting {
 
 impl Runs {
     pub(super) const fn new(patience: Duration) -> Self {
-        Self { runs: BTreeMap::new(), patience, waits: BTreeMap::new(), stopped: false }
+        Self {
+            runs: BTreeMap::new(),
+            patience,
+            batches: BTreeMap::new(),
+            waits: BTreeMap::new(),
+            stopped: false,
+        }
     }
 
     /// Takes a run in; `refused` says why it cannot go on.
@@ -62,6 +70,7 @@ impl Runs {
 
     pub(super) fn over(&mut self, tasks: &Range<u32>) {
         self.runs.remove(&tasks.start);
+        self.batches.retain(|_, (task, _)| !tasks.contains(&task.0));
         self.waits.retain(|_, wait| !tasks.contains(&wait.task.0));
     }
 
@@ -84,17 +93,34 @@ impl Runs {
         }
     }
 
+    /// Jobs of one submission are asked for; a batch's jobs have one index after the other.
+    pub(super) fn asked(&mut self, request: &PlanRequest) {
+        if let (Some(first), Some(last)) = (request.jobs.first(), request.jobs.last()) {
+            // What is asked again after a reconnect is a part of what was asked first.
+            let indices = first.index.0..=last.index.0;
+            self.batches.entry(request.batch).or_insert((request.task, indices));
+        }
+    }
+
     /// A batch waits for a device.
     pub(super) fn waits(&mut self, batch: BatchId, task: TaskId, reason: WaitReason, now: Instant) {
         let wait = self.waits.entry(batch).or_insert(Waiting { task, reason, since: now });
         wait.reason = reason;
     }
 
-    /// A batch waits no longer.
+    /// The batches of the planned jobs wait no longer.
     pub(super) fn planned(&mut self, plan: &Plan) {
-        if let Some(batch) = plan.batch {
-            self.waits.remove(&batch);
+        if self.waits.is_empty() {
+            return;
         }
+        let planned = || plan.nodes.iter().flat_map(|node| &node.devices).flat_map(|device| &device.jobs);
+        self.waits.retain(|batch, _| {
+            let known = self.batches.get(batch);
+            let names = |(task, indices): &(TaskId, RangeInclusive<u32>)| {
+                planned().any(|job| job.job.task == *task && indices.contains(&job.job.index.0))
+            };
+            plan.batch != Some(*batch) && !known.is_some_and(names)
+        });
     }
 
     /// Why jobs wait, if some do.
@@ -168,7 +194,11 @@ impl Drop for Listener {
 
 #[cfg(test)]
 mod tests {
-    use farm_core::{id::AppId, id::JobIndex, message::JobFailure};
+    use farm_core::{
+        device::Requirements,
+        id::{AppId, Attempt, DeviceIndex, Epoch, JobAttempt, JobIndex, NodeId, NodeSession},
+        message::{Contact, CostNs, DevicePlan, JobFailure, NodePlan, PlanJob},
+    };
 
     use super::*;
 
@@ -228,5 +258,31 @@ mod tests {
         assert_eq!(runs.waiting(), None);
         drop(runs);
         assert!(matches!(events.try_recv(), Ok(RunEvent::Ended(RunEnd::Farm(FarmError::Closed)))));
+    }
+
+    /// After a node is lost the coordinator plans on its own: such a plan answers no request.
+    #[test]
+    fn an_unasked_plan_ends_the_wait_of_its_jobs_alone() {
+        let mut runs = Runs::new(Duration::from_secs(60));
+        for (batch, indices) in [(1, 0..10), (2, 10..20)] {
+            let jobs = indices.map(|index| PlanJob { index: JobIndex(index), cost: CostNs(0) }).collect();
+            let (needs, contents) = (Requirements::ANY, Vec::new());
+            runs.asked(&PlanRequest { batch: BatchId(batch), task: TaskId(0), jobs, needs, contents });
+            runs.waits(BatchId(batch), TaskId(0), WaitReason::NoNode, Instant::now());
+        }
+        let unasked = |task, index| {
+            let job = JobId { app: AppId(1), task: TaskId(task), index: JobIndex(index) };
+            let job = JobAttempt { job, attempt: Attempt { epoch: Epoch(1), sequence: 9 } };
+            let devices = vec![DevicePlan { device: DeviceIndex(0), jobs: vec![job] }];
+            let contact = Contact { addresses: Vec::new(), certificate_der: Vec::new() };
+            let node = NodePlan { node: NodeId(1), session: NodeSession(1), contact, devices };
+            Plan { batch: None, nodes: vec![node] }
+        };
+        runs.planned(&unasked(1, 3));
+        assert_eq!(runs.waits.len(), 2, "another task's plan says nothing");
+        runs.planned(&unasked(0, 10));
+        assert_eq!(runs.waits.keys().copied().collect::<Vec<_>>(), [BatchId(1)]);
+        runs.over(&(0..1));
+        assert!(runs.waits.is_empty() && runs.batches.is_empty());
     }
 }
