@@ -77,6 +77,45 @@ impl fmt::Display for JobId {
     }
 }
 
+/// A job inside its application.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub(crate) struct JobKey {
+    pub(crate) task: TaskId,
+    pub(crate) index: JobIndex,
+}
+
+impl JobKey {
+    pub(crate) const fn of(job: JobId) -> Self {
+        Self { task: job.task, index: job.index }
+    }
+
+    pub(crate) const fn in_app(self, app: AppId) -> JobId {
+        JobId { app, task: self.task, index: self.index }
+    }
+
+    /// First and last key that a job of `task` can have.
+    pub(crate) const fn range_of(task: TaskId) -> std::ops::RangeInclusive<Self> {
+        Self { task, index: JobIndex(0) }..=Self { task, index: JobIndex(u32::MAX) }
+    }
+}
+
+impl fmt::Display for JobKey {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}/{}", self.task.0, self.index.0)
+    }
+}
+
+impl JobId {
+    /// First and last id that a job of `app` can have.
+    pub(crate) const fn range_of(app: AppId) -> std::ops::RangeInclusive<Self> {
+        Self { app, task: TaskId(0), index: JobIndex(0) }..=Self {
+            app,
+            task: TaskId(u32::MAX),
+            index: JobIndex(u32::MAX),
+        }
+    }
+}
+
 /// One try at executing a job. Compared lexicographically, so a coordinator that lost its job state still issues
 /// larger attempts than any before it: fencing without per-job durability.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
@@ -111,6 +150,14 @@ impl fmt::Display for JobAttempt {
 /// The blake3 digest of some bytes: the name of a task allocation, a module or a result payload. Computed by drivers.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 pub struct ContentHash(pub [u8; 32]);
+
+impl ContentHash {
+    /// blake3 of no bytes: the digest of a failed attempt's payload.
+    pub const EMPTY: Self = Self([
+        0xaf, 0x13, 0x49, 0xb9, 0xf5, 0xf9, 0xa1, 0xa6, 0xa0, 0x40, 0x4d, 0xea, 0x36, 0xdc, 0xc9, 0x49, 0x9b,
+        0xcb, 0x25, 0xc9, 0xad, 0xc1, 0x12, 0xb7, 0xcc, 0x9a, 0x93, 0xca, 0xe4, 0x1f, 0x32, 0x62,
+    ]);
+}
 
 impl fmt::Display for ContentHash {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {

@@ -6,8 +6,8 @@ use serde::{Deserialize, Serialize};
 use crate::{
     device::{DeviceInfo, Requirements},
     id::{
-        AppId, AppIncarnation, BatchId, ContentHash, DeviceIndex, Epoch, JobAttempt, JobId, JobIndex, NodeId, NodeSession,
-        TaskId,
+        AppId, AppIncarnation, BatchId, ContentHash, DeviceIndex, Epoch, JobAttempt, JobId, JobIndex, NodeId,
+        NodeSession, TaskId,
     },
     program::Content,
 };

@@ -2,12 +2,27 @@
 //!
 //! It owns plans, load and fairness; it never owns job payloads, sockets or clocks. A driver feeds events by connection
 //! ([`LinkId`]) and carries the effects out.
+//!
+//! Split by event family: `registry` (who is there), `placement` (where jobs go), `report` (what ended), `replan` (what
+//! was lost), `lease` (who is silent), `status` (what operators see). `model` holds the state they share.
+
+mod invariants;
+mod lease;
+mod model;
+mod placement;
+mod registry;
+mod replan;
+mod report;
+mod status;
+
+use std::collections::{BTreeMap, VecDeque};
 
 use serde::{Deserialize, Serialize};
 
+use self::model::{App, Calibration, Node, Peer, Pending};
 use crate::{
     device::DeviceKind,
-    id::{AppId, DeviceIndex, Epoch, LinkId, NodeId},
+    id::{AppId, BatchId, DeviceIndex, Epoch, JobKey, LinkId, NodeId},
     message::{AppToCoordinator, CoordinatorToApp, CoordinatorToNode, Liveness, NodeToCoordinator},
     time::Instant,
 };
@@ -176,45 +191,154 @@ pub struct FarmStatus {
 #[derive(Debug)]
 pub struct CoordinatorMachine {
     config: CoordinatorConfig,
+    /// Who is at the other end of a connection that said hello.
+    links: BTreeMap<LinkId, Peer>,
+    apps: BTreeMap<AppId, App>,
+    nodes: BTreeMap<NodeId, Node>,
+    /// A node's id goes with its name, over restarts too.
+    names: BTreeMap<String, NodeId>,
+    next_app: u32,
+    next_node: u32,
+    next_attempt: u64,
+    calibration: Calibration,
+    /// Jobs to be placed before the current event is done with, first come, first served.
+    fresh: VecDeque<Pending>,
+    /// Jobs that no device can take now, first come, first served; tried again when that may have changed.
+    stuck: VecDeque<Pending>,
+    /// Jobs that lost their place during the current event.
+    lost: BTreeMap<(AppId, BatchId), Vec<JobKey>>,
+    /// No later than the earliest deadline.
+    wake: Option<Instant>,
+    delivered_jobs: u64,
+    replanned_jobs: u64,
+    effects: VecDeque<Effect>,
 }
 
 impl CoordinatorMachine {
     /// A coordinator that knows nobody yet.
     #[must_use]
     pub fn new(config: CoordinatorConfig) -> Self {
-        Self { config }
+        Self {
+            config,
+            links: BTreeMap::new(),
+            apps: BTreeMap::new(),
+            nodes: BTreeMap::new(),
+            names: BTreeMap::new(),
+            next_app: 1,
+            next_node: 1,
+            next_attempt: 1,
+            calibration: Calibration::default(),
+            fresh: VecDeque::new(),
+            stuck: VecDeque::new(),
+            lost: BTreeMap::new(),
+            wake: None,
+            delivered_jobs: 0,
+            replanned_jobs: 0,
+            effects: VecDeque::new(),
+        }
     }
 
     /// Takes one event in.
     pub fn handle(&mut self, now: Instant, event: Event) {
-        let _ = (now, event, &self.config);
+        match event {
+            Event::FromApp { link, message } => self.from_app(now, link, message),
+            Event::FromNode { link, message } => self.from_node(now, link, message),
+            Event::LinkClosed { link } => self.link_closed(now, link),
+            Event::DrainRequested { node } => self.drain(node),
+        }
+        self.place_pending(now);
     }
 
     /// Acts on the timers that are due.
     pub fn handle_timeout(&mut self, now: Instant) {
-        let _ = now;
+        if self.wake.is_none_or(|wake| wake > now) {
+            return;
+        }
+        self.expire(now);
+        self.place_pending(now);
+        self.rearm();
     }
 
     /// When [`Self::handle_timeout`] wants to be called next.
     #[must_use]
-    pub fn poll_timeout(&self) -> Option<Instant> {
-        None
+    pub const fn poll_timeout(&self) -> Option<Instant> {
+        self.wake
     }
 
     /// The next thing to do; call until `None` after every `handle` and `handle_timeout`.
     pub fn poll_effect(&mut self) -> Option<Effect> {
-        None
+        self.effects.pop_front()
     }
 
-    /// The farm as an operator sees it.
-    #[must_use]
-    pub fn status(&self) -> FarmStatus {
-        FarmStatus { epoch: self.config.epoch, nodes: Vec::new(), apps: Vec::new(), delivered_jobs: 0, replanned_jobs: 0 }
+    fn from_app(&mut self, now: Instant, link: LinkId, message: AppToCoordinator) {
+        let app = match (self.links.get(&link), message) {
+            (None, AppToCoordinator::Hello(hello)) => return self.app_hello(now, link, hello),
+            (Some(Peer::App(app)), message) => (*app, message),
+            (None | Some(Peer::Node(_)), _) => return self.protocol_error(now, link),
+        };
+        let (app, message) = app;
+        self.app_heard(now, app);
+        match message {
+            AppToCoordinator::Hello(_) => self.protocol_error(now, link),
+            AppToCoordinator::Plan(request) => self.plan_requested(app, request),
+            AppToCoordinator::AlreadyDelivered(jobs) => self.already_delivered(app, &jobs),
+            AppToCoordinator::Unreachable { node, session } => self.unreachable(now, app, node, session),
+            AppToCoordinator::Cancel(task) => self.cancel_task(app, task),
+            AppToCoordinator::Heartbeat { sequence } => {
+                self.tell_app(app, CoordinatorToApp::HeartbeatAck { sequence });
+            }
+            AppToCoordinator::Goodbye => {
+                self.close(link);
+                self.app_leaves(app);
+            }
+        }
     }
 
-    /// Asserts what must hold between any two events.
-    ///
-    /// # Panics
-    /// An invariant is broken; the message says which.
-    pub fn check_invariants(&self) {}
+    fn from_node(&mut self, now: Instant, link: LinkId, message: NodeToCoordinator) {
+        let node = match (self.links.get(&link), message) {
+            (None, NodeToCoordinator::Hello(hello)) => return self.node_hello(now, link, hello),
+            (Some(Peer::Node(node)), message) => (*node, message),
+            (None | Some(Peer::App(_)), _) => return self.protocol_error(now, link),
+        };
+        let (node, message) = node;
+        self.node_heard(now, node);
+        match message {
+            NodeToCoordinator::Hello(_) => self.protocol_error(now, link),
+            NodeToCoordinator::Heartbeat { sequence, devices, spool_bytes: _ } => {
+                self.loads_reported(node, &devices);
+                self.tell_node(node, CoordinatorToNode::HeartbeatAck { sequence });
+            }
+            NodeToCoordinator::Report { executed, delivered } => {
+                self.reported(now, node, executed, &delivered)
+            }
+            NodeToCoordinator::DeviceLost { device, reason } => self.device_lost(node, device, &reason),
+            NodeToCoordinator::Goodbye => {
+                self.close(link);
+                self.node_leaves(now, node);
+            }
+        }
+    }
+
+    fn tell_app(&mut self, app: AppId, message: CoordinatorToApp) {
+        if let Some(link) = self.apps.get(&app).and_then(|app| app.link) {
+            self.effects.push_back(Effect::ToApp { link, message });
+        }
+    }
+
+    fn tell_node(&mut self, node: NodeId, message: CoordinatorToNode) {
+        if let Some(link) = self.nodes.get(&node).and_then(|node| node.link) {
+            self.effects.push_back(Effect::ToNode { link, message });
+        }
+    }
+
+    /// Forgets a connection and closes it; its `LinkClosed` will find nobody.
+    fn close(&mut self, link: LinkId) {
+        self.links.remove(&link);
+        self.effects.push_back(Effect::Close { link });
+    }
+
+    /// Makes sure that the timers are looked at no later than `at`.
+    fn arm(&mut self, at: Instant) {
+        self.wake = Some(self.wake.map_or(at, |wake| wake.min(at)));
+    }
 }

@@ -1,14 +1,28 @@
 //! The application's job ledger: the owner of the truth about an application's jobs (20-delivery.md).
 //!
 //! It decides which attempt of a job counts, gives each job to the application exactly once, and says what to send
-//! where. Programs and results are its driver's, by [`JobId`].
+//! where. Programs and results are its driver's, by [`JobId`]. It never chooses a node: plans are the coordinator's.
+//!
+//! `jobs` owns what is open and what is over, `session` the talk with the coordinator, `nodes` the data links.
 
+mod invariants;
+mod jobs;
+mod nodes;
+mod session;
+
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
+
+use self::{
+    jobs::{Batch, Job},
+    nodes::{Node, NodeLife},
+    session::{Identity, Session},
+};
 use crate::{
     device::Requirements,
-    id::{AppId, BatchId, ContentHash, JobAttempt, JobId, JobIndex, NodeId, NodeSession, TaskId},
+    id::{AppId, BatchId, ContentHash, JobAttempt, JobId, JobIndex, JobKey, NodeId, NodeSession, TaskId},
     message::{
-        AppHello, AppToCoordinator, AppToNode, Contact, CoordinatorToApp, CostNs, JobFailure, NodeToApp, Priority,
-        WaitReason,
+        AppHello, AppToCoordinator, AppToNode, Contact, CoordinatorToApp, CostNs, JobFailure, Liveness,
+        NodeToApp, Priority, WaitReason,
     },
     program::Content,
     time::Instant,
@@ -68,9 +82,9 @@ pub enum Event {
         /// What. A result's payload is the driver's, who has checked it against the header's digest.
         message: NodeToApp,
     },
-    /// The application gives a task up.
+    /// The application gives a task up: each of its open jobs ends with [`Effect::Fail`] of `Cancelled`.
     Cancelled(TaskId),
-    /// The application is done: say goodbye.
+    /// The application is done: say goodbye. Open jobs are dropped without a further word; later events are ignored.
     Finished,
 }
 
@@ -166,51 +180,119 @@ pub struct LedgerCounts {
 #[derive(Debug)]
 pub struct Ledger {
     hello: AppHello,
+    session: Session,
+    identity: Option<Identity>,
+    liveness: Liveness,
+    heartbeat_sequence: u64,
+    /// Jobs that may still be delivered or fail.
+    jobs: BTreeMap<JobKey, Job>,
+    /// Jobs that were delivered or failed: nothing more may come of them.
+    over: BTreeSet<JobKey>,
+    /// Batches with open jobs.
+    batches: BTreeMap<BatchId, Batch>,
+    /// Batches to be asked for, in order of submission.
+    to_request: VecDeque<BatchId>,
+    /// Open jobs of the batches asked for.
+    requested_jobs: u64,
+    next_batch: u64,
+    nodes: BTreeMap<NodeLife, Node>,
+    /// When a node's link wants to be looked at again.
+    deadlines: BTreeMap<NodeLife, Instant>,
+    /// Nodes with something to flush.
+    dirty: BTreeSet<NodeLife>,
+    /// Answers to re-plans that came too late, to be flushed.
+    already_delivered: Vec<JobId>,
+    counts: LedgerCounts,
+    effects: VecDeque<Effect>,
 }
 
 impl Ledger {
     /// A ledger of an application that is not registered yet.
     #[must_use]
     pub fn new(hello: AppHello) -> Self {
-        Self { hello }
+        let identity = hello.resume.map(|(app, incarnation)| Identity { app, incarnation });
+        Self {
+            hello,
+            session: Session::Offline,
+            identity,
+            liveness: Liveness::default(),
+            heartbeat_sequence: 0,
+            jobs: BTreeMap::new(),
+            over: BTreeSet::new(),
+            batches: BTreeMap::new(),
+            to_request: VecDeque::new(),
+            requested_jobs: 0,
+            next_batch: 0,
+            nodes: BTreeMap::new(),
+            deadlines: BTreeMap::new(),
+            dirty: BTreeSet::new(),
+            already_delivered: Vec::new(),
+            counts: LedgerCounts::default(),
+            effects: VecDeque::new(),
+        }
     }
 
     /// Takes one event in.
     pub fn handle(&mut self, now: Instant, event: Event) {
-        let _ = (now, event, &self.hello);
+        if self.session == Session::Finished {
+            return;
+        }
+        match event {
+            Event::CoordinatorConnected => self.coordinator_connected(),
+            Event::FromCoordinator(message) => self.from_coordinator(now, message),
+            Event::CoordinatorLost => self.coordinator_lost(),
+            Event::Submitted { task, jobs, needs } => self.submitted(task, jobs, needs),
+            Event::NodeConnected { node, session } => self.node_connected(now, NodeLife { node, session }),
+            Event::NodeLost { node, session } => self.node_lost(now, NodeLife { node, session }),
+            Event::FromNode { node, session, message } => {
+                self.from_node(now, NodeLife { node, session }, message)
+            }
+            Event::Cancelled(task) => self.cancelled(task),
+            Event::Finished => self.finished(),
+        }
     }
 
     /// Acts on the timers that are due.
     pub fn handle_timeout(&mut self, now: Instant) {
-        let _ = now;
+        self.session_timeout(now);
+        self.node_timeouts(now);
     }
 
     /// When [`Self::handle_timeout`] wants to be called next.
     #[must_use]
     pub fn poll_timeout(&self) -> Option<Instant> {
-        None
+        self.deadlines.values().copied().chain(self.session.next_heartbeat()).min()
     }
 
     /// The next thing to do; call until `None` after every `handle` and `handle_timeout`.
+    ///
+    /// Tickets and acknowledgements of one burst of events leave together: they are put into messages only when
+    /// everything else has been polled.
     pub fn poll_effect(&mut self) -> Option<Effect> {
-        None
+        if self.effects.is_empty() {
+            self.flush_session();
+            self.flush_nodes();
+        }
+        self.effects.pop_front()
     }
 
     /// The cluster-wide id, once registered.
     #[must_use]
     pub fn app(&self) -> Option<AppId> {
-        None
+        self.identity.map(|identity| identity.app)
     }
 
     /// How far the jobs are.
     #[must_use]
     pub fn counts(&self) -> LedgerCounts {
-        LedgerCounts::default()
+        self.counts
     }
 
-    /// Asserts what must hold between any two events.
-    ///
-    /// # Panics
-    /// An invariant is broken; the message says which.
-    pub fn check_invariants(&self) {}
+    fn push(&mut self, effect: Effect) {
+        self.effects.push_back(effect);
+    }
+
+    fn tell_coordinator(&mut self, message: AppToCoordinator) {
+        self.push(Effect::ToCoordinator(message));
+    }
 }

@@ -93,7 +93,12 @@ impl JobProgram {
     }
 
     /// An entry point of a module with values for its `override` constants.
-    pub fn function_with_constants(&mut self, module: Content, entry: &str, constants: &[(&str, f64)]) -> Kernel {
+    pub fn function_with_constants(
+        &mut self,
+        module: Content,
+        entry: &str,
+        constants: &[(&str, f64)],
+    ) -> Kernel {
         let kernel = Kernel(self.kernels);
         self.kernels += 1;
         let constants = constants.iter().map(|(name, value)| ((*name).to_owned(), *value)).collect();
@@ -115,7 +120,12 @@ impl JobProgram {
     ///
     /// # Errors
     /// The range leaves the buffer, is not aligned to 4, or the buffer is a task allocation.
-    pub fn memcpy_htod_buffer(&mut self, buffer: Buffer, offset_bytes: u64, bytes: &[u8]) -> Result<(), DispatchError> {
+    pub fn memcpy_htod_buffer(
+        &mut self,
+        buffer: Buffer,
+        offset_bytes: u64,
+        bytes: &[u8],
+    ) -> Result<(), DispatchError> {
         const VERB: &str = "memcpy_htod_buffer";
         self.check_writable(VERB, buffer)?;
         self.check_range(VERB, buffer, offset_bytes, bytes.len() as u64)?;
@@ -173,7 +183,12 @@ impl JobProgram {
     ///
     /// # Errors
     /// As [`Self::launch`].
-    pub fn launch_with_cost(&mut self, kernel: Kernel, groups: [u32; 3], cost: CostNs) -> Result<(), DispatchError> {
+    pub fn launch_with_cost(
+        &mut self,
+        kernel: Kernel,
+        groups: [u32; 3],
+        cost: CostNs,
+    ) -> Result<(), DispatchError> {
         self.push_launch(kernel, groups, None, cost)
     }
 
@@ -195,7 +210,12 @@ impl JobProgram {
     ///
     /// # Errors
     /// The range leaves the buffer or is not aligned to 4, or the buffer is a task allocation.
-    pub fn memcpy_dtoh(&mut self, buffer: Buffer, offset_bytes: u64, size_bytes: u64) -> Result<(), DispatchError> {
+    pub fn memcpy_dtoh(
+        &mut self,
+        buffer: Buffer,
+        offset_bytes: u64,
+        size_bytes: u64,
+    ) -> Result<(), DispatchError> {
         const VERB: &str = "memcpy_dtoh";
         self.check_writable(VERB, buffer)?;
         self.check_range(VERB, buffer, offset_bytes, size_bytes)?;
@@ -231,9 +251,11 @@ impl JobProgram {
     }
 
     fn buffer_bytes(&self, verb: &'static str, buffer: Buffer) -> Result<u64, DispatchError> {
-        self.definition(buffer)
-            .map(|(size_bytes, _)| size_bytes)
-            .ok_or(DispatchError::UnknownHandle { verb, what: "buffer", handle: buffer.0 })
+        self.definition(buffer).map(|(size_bytes, _)| size_bytes).ok_or(DispatchError::UnknownHandle {
+            verb,
+            what: "buffer",
+            handle: buffer.0,
+        })
     }
 
     fn check_writable(&self, verb: &'static str, buffer: Buffer) -> Result<(), DispatchError> {
@@ -256,7 +278,13 @@ impl JobProgram {
             return Err(DispatchError::Size { verb, size_bytes });
         }
         if offset_bytes.checked_add(size_bytes).is_none_or(|end| end > buffer_bytes) {
-            return Err(DispatchError::OutOfRange { verb, buffer: buffer.0, offset_bytes, size_bytes, buffer_bytes });
+            return Err(DispatchError::OutOfRange {
+                verb,
+                buffer: buffer.0,
+                offset_bytes,
+                size_bytes,
+                buffer_bytes,
+            });
         }
         Ok(())
     }
@@ -265,7 +293,9 @@ impl JobProgram {
     fn definition(&self, wanted: Buffer) -> Option<(u64, Access)> {
         self.commands.iter().find_map(|command| match command {
             Command::Malloc { buffer, size_bytes } if *buffer == wanted => Some((*size_bytes, Access::InOut)),
-            Command::TaskAllocation { buffer, content } if *buffer == wanted => Some((content.size_bytes, Access::In)),
+            Command::TaskAllocation { buffer, content } if *buffer == wanted => {
+                Some((content.size_bytes, Access::In))
+            }
             _ => None,
         })
     }
@@ -277,11 +307,16 @@ pub(super) mod bytes_field {
 
     use serde::{Deserializer, Serializer, de::Visitor};
 
-    pub(in crate::program) fn serialize<S: Serializer>(bytes: &[u8], serializer: S) -> Result<S::Ok, S::Error> {
+    pub(in crate::program) fn serialize<S: Serializer>(
+        bytes: &[u8],
+        serializer: S,
+    ) -> Result<S::Ok, S::Error> {
         serializer.serialize_bytes(bytes)
     }
 
-    pub(in crate::program) fn deserialize<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Vec<u8>, D::Error> {
+    pub(in crate::program) fn deserialize<'de, D: Deserializer<'de>>(
+        deserializer: D,
+    ) -> Result<Vec<u8>, D::Error> {
         struct Bytes;
         impl Visitor<'_> for Bytes {
             type Value = Vec<u8>;

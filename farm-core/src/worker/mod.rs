@@ -2,10 +2,40 @@
 //! one staged job, local stealing, the result spool's book-keeping.
 //!
 //! It never sees payloads: its driver keeps programs, contents and results by [`JobAttempt`] and [`ContentHash`].
+//!
+//! Split by event family: `session` (coordinator), `app` (applications and their links), `intake` (jobs that arrive or
+//! leave early), `content`, `device` (staging, stealing, completion), `lottery`, `spool` (results until acknowledged),
+//! `report`, `drain`. `job` holds the records they share.
 
+mod app;
+mod content;
+mod device;
+mod drain;
+mod intake;
+mod invariants;
+mod job;
+mod lottery;
+mod report;
+mod session;
+mod spool;
+
+use std::collections::{BTreeMap, VecDeque};
+
+use rand::{SeedableRng, rngs::SmallRng};
+
+use self::{
+    app::App,
+    content::Holding,
+    device::Device,
+    drain::Drain,
+    job::{HeldJob, Tombstones},
+    lottery::{FairShare, Lottery},
+    report::Reports,
+    session::Session,
+};
 use crate::{
     device::DeviceInfo,
-    id::{ContentHash, DeviceIndex, JobAttempt, LinkId, NodeId, NodeSession},
+    id::{AppId, ContentHash, DeviceIndex, JobAttempt, JobId, LinkId, NodeId, NodeSession},
     message::{AppToNode, Contact, CoordinatorToNode, JobFailure, NodeToApp, NodeToCoordinator},
     program::Content,
     time::Instant,
@@ -140,45 +170,127 @@ pub enum Effect {
 #[derive(Debug)]
 pub struct WorkerMachine {
     config: WorkerConfig,
+    session: Session,
+    node: Option<NodeId>,
+    heartbeat_sequence: u64,
+    drain: Drain,
+    apps: BTreeMap<AppId, App>,
+    links: BTreeMap<LinkId, AppId>,
+    /// One attempt of each job at most: a larger one replaces a smaller one.
+    jobs: BTreeMap<JobId, HeldJob>,
+    tombstones: Tombstones,
+    /// Order of arrival, for first come, first served.
+    next_arrival: u64,
+    contents: BTreeMap<ContentHash, Holding>,
+    /// When contents that failed to come are asked for again.
+    refetch_at: Option<Instant>,
+    devices: Vec<Device>,
+    share: Box<dyn FairShare>,
+    rng: SmallRng,
+    reports: Reports,
+    /// Results executed and not acknowledged, in bytes.
+    spool_bytes: u64,
+    effects: VecDeque<Effect>,
 }
 
 impl WorkerMachine {
     /// A worker that is not registered yet.
     #[must_use]
     pub fn new(config: WorkerConfig) -> Self {
-        Self { config }
+        let devices = config.devices.iter().cloned().map(Device::new).collect();
+        let share = Box::new(Lottery::new(config.lottery_gain));
+        let rng = SmallRng::seed_from_u64(config.seed);
+        Self {
+            config,
+            session: Session::Offline,
+            node: None,
+            heartbeat_sequence: 0,
+            drain: Drain::No,
+            apps: BTreeMap::new(),
+            links: BTreeMap::new(),
+            jobs: BTreeMap::new(),
+            tombstones: Tombstones::default(),
+            next_arrival: 0,
+            contents: BTreeMap::new(),
+            refetch_at: None,
+            devices,
+            share,
+            rng,
+            reports: Reports::default(),
+            spool_bytes: 0,
+            effects: VecDeque::new(),
+        }
     }
 
     /// Takes one event in.
     pub fn handle(&mut self, now: Instant, event: Event) {
-        let _ = (now, event, &self.config);
+        if self.drain == Drain::Gone {
+            return;
+        }
+        match event {
+            Event::CoordinatorConnected => self.coordinator_connected(),
+            Event::FromCoordinator(message) => self.from_coordinator(now, message),
+            Event::CoordinatorLost => self.coordinator_lost(),
+            Event::FromApp { link, message } => self.from_app(now, link, message),
+            Event::AppLinkClosed { link } => self.app_link_closed(now, link),
+            Event::ContentReady(content) => self.content_ready(content),
+            Event::ContentFailed { content, reason } => self.content_failed(now, content, &reason),
+            Event::Started { job, device } => self.started(job, device),
+            Event::Executed { job, device, device_time_ns, outcome } => {
+                self.executed(now, job, device, device_time_ns, outcome);
+            }
+            Event::DeviceLost { device, reason } => self.device_lost(now, device, &reason),
+            Event::DrainRequested => self.start_drain(now),
+        }
+        self.settle(now);
     }
 
     /// Acts on the timers that are due.
     pub fn handle_timeout(&mut self, now: Instant) {
-        let _ = now;
+        if self.drain == Drain::Gone {
+            return;
+        }
+        self.session_timeout(now);
+        self.app_timeout(now);
+        self.content_timeout(now);
+        self.settle(now);
     }
 
     /// When [`Self::handle_timeout`] wants to be called next.
     #[must_use]
     pub fn poll_timeout(&self) -> Option<Instant> {
-        None
+        if self.drain == Drain::Gone {
+            return None;
+        }
+        let registered = self.session.next_heartbeat();
+        let reports = registered.and(self.reports.due());
+        let apps = self.apps.values().filter_map(|app| app.drop_at).min();
+        [registered, reports, self.refetch_at, self.drain.deadline(), apps].into_iter().flatten().min()
     }
 
     /// The next thing to do; call until `None` after every `handle` and `handle_timeout`.
     pub fn poll_effect(&mut self) -> Option<Effect> {
-        None
+        self.effects.pop_front()
     }
 
     /// The node's id, once registered.
     #[must_use]
-    pub fn node(&self) -> Option<NodeId> {
-        None
+    pub const fn node(&self) -> Option<NodeId> {
+        self.node
     }
 
-    /// Asserts what must hold between any two events.
-    ///
-    /// # Panics
-    /// An invariant is broken; the message says which.
-    pub fn check_invariants(&self) {}
+    /// What follows from any event: devices get work, reports leave, a drained node goes.
+    fn settle(&mut self, now: Instant) {
+        self.fill_devices();
+        self.flush_reports(now);
+        self.advance_drain(now);
+    }
+
+    fn push(&mut self, effect: Effect) {
+        self.effects.push_back(effect);
+    }
+
+    fn tell_coordinator(&mut self, message: NodeToCoordinator) {
+        self.push(Effect::ToCoordinator(message));
+    }
 }

@@ -1,0 +1,105 @@
+//! What must hold in a coordinator between any two events.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use super::{
+    CoordinatorMachine,
+    model::{JobState, Peer},
+};
+use crate::id::{AppId, DeviceIndex, JobKey};
+
+impl CoordinatorMachine {
+    /// Asserts what must hold between any two events.
+    ///
+    /// # Panics
+    /// An invariant is broken; the message says which.
+    pub fn check_invariants(&self) {
+        assert!(self.fresh.is_empty() && self.lost.is_empty(), "I1: jobs are left between two events");
+        self.check_links();
+        self.check_jobs();
+        self.check_books();
+        self.check_queue();
+    }
+
+    fn check_links(&self) {
+        for (link, peer) in &self.links {
+            let known = match peer {
+                Peer::App(app) => self.apps.get(app).is_some_and(|app| app.link == Some(*link)),
+                Peer::Node(node) => self.nodes.get(node).is_some_and(|node| node.link == Some(*link)),
+            };
+            assert!(known, "{link} leads to nobody");
+        }
+        let linked = self.apps.values().filter(|app| app.link.is_some()).count()
+            + self.nodes.values().filter(|node| node.link.is_some()).count();
+        assert_eq!(linked, self.links.len(), "each connected peer has one link");
+    }
+
+    fn check_jobs(&self) {
+        let mut attempts = BTreeSet::new();
+        for (id, app) in &self.apps {
+            let mut open: BTreeMap<_, u32> = BTreeMap::new();
+            let mut waiting = 0;
+            for (key, job) in &app.jobs {
+                *open.entry(job.batch).or_default() += 1;
+                match job.state.holder() {
+                    None => waiting += 1,
+                    Some((node, attempt)) => {
+                        assert!(attempts.insert(attempt), "I4: {attempt} was issued twice");
+                        assert!(attempt.sequence < self.next_attempt, "I4: {attempt} was never issued");
+                        let booked =
+                            self.nodes.get(&node).is_some_and(|node| node.jobs.contains(&key.in_app(*id)));
+                        assert!(booked, "I1: {id} {key} is on {node}, which does not know it");
+                    }
+                }
+                assert!(!app.failed.contains_key(key), "I2: {id} {key} is open and failed");
+            }
+            assert_eq!(waiting, app.waiting_jobs, "I1: {id} counts its waiting jobs");
+            let batches: BTreeMap<_, u32> =
+                app.batches.iter().map(|(&id, batch)| (id, batch.open_jobs)).collect();
+            assert_eq!(open, batches, "I8: {id} keeps exactly the batches that have open jobs");
+        }
+    }
+
+    fn check_books(&self) {
+        for (id, node) in &self.nodes {
+            let mut loads: BTreeMap<DeviceIndex, (u128, u64)> = BTreeMap::new();
+            for job in &node.jobs {
+                let state = self
+                    .apps
+                    .get(&job.app)
+                    .and_then(|app| app.jobs.get(&JobKey::of(*job)))
+                    .map(|job| job.state);
+                let held = state.and_then(JobState::holder).map(|(node, _)| node);
+                assert_eq!(held, Some(*id), "I1: {id} has {job} on its books, which is elsewhere");
+                if let Some(JobState::Placed(place)) = state {
+                    let (queued_ns, jobs) = loads.entry(place.device).or_default();
+                    *queued_ns += u128::from(place.load_ns);
+                    *jobs += 1;
+                }
+            }
+            for (index, device) in (0_u16..).zip(&node.devices) {
+                let expected = loads.remove(&DeviceIndex(index)).unwrap_or_default();
+                let booked = (device.queued_ns, device.planned_jobs);
+                assert_eq!(booked, expected, "load of {id} {}", DeviceIndex(index));
+            }
+            assert!(loads.is_empty(), "{id} holds jobs of devices it does not have");
+        }
+    }
+
+    /// I1: each waiting job is in line once.
+    fn check_queue(&self) {
+        let mut queued: BTreeSet<(AppId, JobKey)> = BTreeSet::new();
+        for pending in &self.stuck {
+            let Some(app) = self.apps.get(&pending.app) else {
+                panic!("I8: jobs of {}, which left, are in line", pending.app)
+            };
+            for &key in &pending.keys {
+                if app.jobs.get(&key).is_some_and(|job| job.state == JobState::Waiting) {
+                    assert!(queued.insert((pending.app, key)), "I1: {} {key} is in line twice", pending.app);
+                }
+            }
+        }
+        let waiting: u64 = self.apps.values().map(|app| app.waiting_jobs).sum();
+        assert_eq!(queued.len() as u64, waiting, "I1: each waiting job is in line");
+    }
+}

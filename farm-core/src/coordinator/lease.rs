@@ -1,0 +1,151 @@
+//! Who is silent, since when, and what follows: suspect, dead, lease over.
+
+use std::time::Duration;
+
+use super::{CoordinatorMachine, NodeState, model::Node, replan::Blame};
+use crate::{
+    id::{AppId, NodeId},
+    message::Liveness,
+    time::Instant,
+};
+
+impl CoordinatorMachine {
+    pub(super) fn app_heard(&mut self, now: Instant, id: AppId) {
+        if let Some(app) = self.apps.get_mut(&id) {
+            app.last_heard = now;
+        }
+    }
+
+    pub(super) fn node_heard(&mut self, now: Instant, id: NodeId) {
+        let Some(node) = self.nodes.get_mut(&id) else { return };
+        node.last_heard = now;
+        if node.state == NodeState::Suspect {
+            node.state = NodeState::Alive;
+            self.retry_stuck();
+        }
+    }
+
+    /// An application's connection is gone: its jobs go on for the time of its lease.
+    pub(super) fn app_away(&mut self, now: Instant, id: AppId) {
+        let lease_until = now.after(Duration::from_millis(self.config.app_lease_ms));
+        if let Some(app) = self.apps.get_mut(&id) {
+            app.link = None;
+            app.lease_until = lease_until;
+            self.arm(lease_until);
+        }
+    }
+
+    /// A node's connection is gone: suspect at once, dead if it does not come back soon.
+    pub(super) fn node_away(&mut self, now: Instant, id: NodeId) {
+        let Some(node) = self.nodes.get_mut(&id) else { return };
+        node.link = None;
+        node.last_heard = now;
+        suspect(node);
+        self.arm(now.after(Duration::from_millis(self.config.liveness.reconnect_ms)));
+    }
+
+    /// Acts on every deadline that is due.
+    pub(super) fn expire(&mut self, now: Instant) {
+        self.expire_nodes(now);
+        self.expire_apps(now);
+    }
+
+    /// Finds the next deadline.
+    pub(super) fn rearm(&mut self) {
+        let liveness = self.config.liveness;
+        let nodes = self.nodes.values().flat_map(|node| {
+            let recheck = node.recheck.as_ref().map(|recheck| recheck.at);
+            [Some(silence_deadline(&liveness, node)), node.full_until, recheck]
+        });
+        let apps = self.apps.values().flat_map(|app| {
+            let lease = match app.link {
+                Some(_) => app.last_heard.after(Duration::from_millis(liveness.dead_ms)),
+                None => app.lease_until,
+            };
+            [Some(lease), app.unreachable.values().min().copied()]
+        });
+        self.wake = nodes.chain(apps).flatten().min();
+    }
+
+    fn expire_nodes(&mut self, now: Instant) {
+        let liveness = self.config.liveness;
+        let mut dead = Vec::new();
+        let mut rechecks = Vec::new();
+        let mut relieved = false;
+        for (&id, node) in &mut self.nodes {
+            if node.full_until.is_some_and(|until| until <= now) {
+                node.full_until = None;
+                relieved = true;
+            }
+            rechecks.extend(node.recheck.take_if(|recheck| recheck.at <= now).map(|recheck| (id, recheck)));
+            let silence = now.since(node.last_heard);
+            let at_least = |bound_ms| silence >= Duration::from_millis(bound_ms);
+            match node.link {
+                // Silent on a standing connection: a partition, as far as one can tell from here.
+                Some(_) if at_least(liveness.dead_ms) => dead.push((id, Blame::Nobody)),
+                Some(_) if at_least(liveness.suspect_ms) => suspect(node),
+                None if at_least(liveness.reconnect_ms) => dead.push((id, Blame::OldestOnEachDevice)),
+                Some(_) | None => {}
+            }
+        }
+        for (id, recheck) in rechecks {
+            self.recheck(id, recheck);
+        }
+        self.declare_dead(now, dead);
+        if relieved {
+            self.retry_stuck();
+        }
+    }
+
+    /// The one place where nodes are given up for their silence. The guard against giving most of the farm up at once
+    /// (20-delivery.md, "most nodes vanish at once") belongs here: all who are due are seen together.
+    fn declare_dead(&mut self, now: Instant, dead: Vec<(NodeId, Blame)>) {
+        for (id, blame) in dead {
+            self.remove_node(now, id, blame);
+        }
+    }
+
+    fn expire_apps(&mut self, now: Instant) {
+        let dead = Duration::from_millis(self.config.liveness.dead_ms);
+        let mut silent = Vec::new();
+        let mut left = Vec::new();
+        let mut reachable = false;
+        for (&id, app) in &mut self.apps {
+            let before = app.unreachable.len();
+            app.unreachable.retain(|_, until| *until > now);
+            reachable |= app.unreachable.len() < before;
+            match app.link {
+                Some(link) if now.since(app.last_heard) >= dead => silent.push((id, link)),
+                None if app.lease_until <= now => left.push(id),
+                Some(_) | None => {}
+            }
+        }
+        for (id, link) in silent {
+            self.close(link);
+            self.app_away(now, id);
+        }
+        for id in left {
+            self.app_leaves(id);
+        }
+        if reachable {
+            self.retry_stuck();
+        }
+    }
+}
+
+fn suspect(node: &mut Node) {
+    match node.state {
+        NodeState::Alive => node.state = NodeState::Suspect,
+        NodeState::Suspect | NodeState::Draining => {}
+    }
+}
+
+/// When a node's silence will next mean something.
+fn silence_deadline(liveness: &Liveness, node: &Node) -> Instant {
+    let bound_ms = match (node.link, node.state) {
+        (None, _) => liveness.reconnect_ms,
+        (Some(_), NodeState::Alive) => liveness.suspect_ms.min(liveness.dead_ms),
+        (Some(_), NodeState::Suspect | NodeState::Draining) => liveness.dead_ms,
+    };
+    node.last_heard.after(Duration::from_millis(bound_ms))
+}

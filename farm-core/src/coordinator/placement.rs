@@ -1,0 +1,343 @@
+//! Where jobs go: first come, first served over plan requests, and list scheduling inside one: each job to the device
+//! with the earliest estimated finish (10-scheduling.md section 1).
+//!
+//! It never moves a job that has a place; that is `replan`'s.
+
+use std::collections::BTreeMap;
+
+use super::{
+    CoordinatorMachine,
+    model::{App, Batch, Job, JobState, Pending, Placement},
+};
+use crate::{
+    device::Requirements,
+    id::{AppId, Attempt, BatchId, DeviceIndex, JobAttempt, JobKey, NodeId},
+    message::{CoordinatorToApp, CostNs, DevicePlan, NodePlan, Plan, PlanRequest, WaitReason},
+    time::Instant,
+};
+
+/// Most jobs in one plan request. The ledger asks for a quarter of it; a peer that asks for more is expelled.
+const MAX_REQUEST_JOBS: usize = 16_384;
+
+/// Most jobs of one application that are neither delivered nor failed: 1 Mi. The ledger keeps to a quarter of it
+/// and holds the rest back in the application's own memory; an application that asks for more is expelled.
+const MAX_APP_JOBS: usize = 1 << 20;
+
+/// Most jobs in one repeated plan.
+const MAX_REPEATED_JOBS: usize = 4_096;
+
+/// What a job of unknown cost counts as when no job of its batch has a known one, in nanoseconds. Only its ratio to
+/// other jobs of unknown cost matters, and that is 1.
+const UNIT_LOAD_NS: u64 = 1_000_000;
+
+/// Costs count up to this, in nanoseconds (about 13 days): no hint can make a device's queue overflow.
+const MAX_LOAD_NS: u64 = 1 << 50;
+
+impl CoordinatorMachine {
+    pub(super) fn plan_requested(&mut self, id: AppId, request: PlanRequest) {
+        let Some(app) = self.apps.get_mut(&id) else { return };
+        if request.jobs.len() > MAX_REQUEST_JOBS || app.jobs.len() + request.jobs.len() > MAX_APP_JOBS {
+            let reason = format!(
+                "a request holds at most {MAX_REQUEST_JOBS} jobs, an application at most {MAX_APP_JOBS} undelivered ones"
+            );
+            self.expel_app(id, reason);
+            return;
+        }
+        let intake = take_in(app, &request);
+        // Asked again: whoever waits is told again.
+        let mut keys = if intake.known_batch { self.withdraw_pending(id, request.batch) } else { Vec::new() };
+        keys.extend(intake.fresh);
+        if !keys.is_empty() {
+            let (batch, task) = (request.batch, request.task);
+            self.fresh.push_back(Pending { app: id, task, batch, answers: Some(batch), keys });
+        }
+        self.repeat_plan(id, Some(request.batch), &intake.placed);
+        for key in intake.failed {
+            self.repeat_failure(id, key);
+        }
+    }
+
+    /// Places what the current event brought up; what finds no device waits in `stuck`.
+    pub(super) fn place_pending(&mut self, now: Instant) {
+        // Jobs that lost their place came before anything that is new.
+        for ((app, batch), keys) in std::mem::take(&mut self.lost).into_iter().rev() {
+            let Some(first) = keys.first() else { continue };
+            self.fresh.push_front(Pending { app, task: first.task, batch, answers: None, keys });
+        }
+        while let Some(pending) = self.fresh.pop_front() {
+            self.place_batch(now, pending);
+        }
+    }
+
+    /// Something changed that may give waiting jobs a device.
+    pub(super) fn retry_stuck(&mut self) {
+        while let Some(pending) = self.stuck.pop_back() {
+            self.fresh.push_front(pending);
+        }
+    }
+
+    pub(super) fn forget_pending(&mut self, gone: impl Fn(&Pending) -> bool) {
+        self.fresh.retain(|pending| !gone(pending));
+        self.stuck.retain(|pending| !gone(pending));
+    }
+
+    /// Says again where the application's jobs are.
+    pub(super) fn repeat_placements(&mut self, id: AppId) {
+        let Some(app) = self.apps.get(&id) else { return };
+        let placed = |job: &Job| matches!(job.state, JobState::Placed(_));
+        let keys: Vec<JobKey> = app.jobs.iter().filter(|(_, job)| placed(job)).map(|(&key, _)| key).collect();
+        for chunk in keys.chunks(MAX_REPEATED_JOBS) {
+            self.repeat_plan(id, None, chunk);
+        }
+    }
+
+    /// Says again where these jobs are, as far as they have a place.
+    pub(super) fn repeat_plan(&mut self, id: AppId, batch: Option<BatchId>, keys: &[JobKey]) {
+        let Some(app) = self.apps.get(&id) else { return };
+        let mut grouped: BTreeMap<NodeId, BTreeMap<DeviceIndex, Vec<JobAttempt>>> = BTreeMap::new();
+        for &key in keys {
+            let Some(JobState::Placed(place)) = app.jobs.get(&key).map(|job| job.state) else { continue };
+            let attempt = JobAttempt { job: key.in_app(id), attempt: place.attempt };
+            grouped.entry(place.node).or_default().entry(place.device).or_default().push(attempt);
+        }
+        let nodes: Vec<NodePlan> =
+            grouped.into_iter().filter_map(|(node, devices)| self.node_plan(node, devices)).collect();
+        if !nodes.is_empty() {
+            self.tell_app(id, CoordinatorToApp::Plan(Plan { batch, nodes }));
+        }
+    }
+
+    fn place_batch(&mut self, now: Instant, mut pending: Pending) {
+        let Some(app) = self.apps.get(&pending.app) else { return };
+        let Some(batch) = app.batches.get(&pending.batch) else { return };
+        let wants = wanted(app, &pending.keys);
+        if wants.is_empty() {
+            return;
+        }
+        // While its application is away a job could not be sent: it would only fill up a device's queue.
+        let candidates =
+            if app.link.is_some() { self.candidates(now, app, &batch.needs) } else { Vec::new() };
+        if candidates.is_empty() {
+            pending.keys = wants.into_iter().map(|want| want.key).collect();
+            self.say_waiting(pending.app, pending.batch);
+            self.stuck.push_back(pending);
+            return;
+        }
+        let candidates = self.list_schedule(now, pending.app, &wants, candidates);
+        let nodes = self.enter_plan(candidates);
+        if pending.answers.is_none() {
+            self.replanned_jobs += wants.len() as u64;
+        }
+        self.tell_app(pending.app, CoordinatorToApp::Plan(Plan { batch: pending.answers, nodes }));
+    }
+
+    /// Devices that may take jobs of these needs, by node and index.
+    fn candidates(&self, now: Instant, app: &App, needs: &Requirements) -> Vec<Candidate> {
+        let mut candidates = Vec::new();
+        for (&id, node) in self.nodes.iter().filter(|(_, node)| node.takes_work()) {
+            if app.unreachable.get(&id).is_some_and(|until| *until > now) {
+                continue;
+            }
+            for (index, device) in (0_u16..).zip(&node.devices) {
+                if device.lost || !needs.fulfilled_by(&device.info) {
+                    continue;
+                }
+                let time_per_load = 1.0 / device.rate(&self.calibration);
+                candidates.push(Candidate {
+                    node: id,
+                    device: DeviceIndex(index),
+                    free_at: device.queued_ns as f64 * time_per_load,
+                    time_per_load,
+                    jobs: Vec::new(),
+                    load_ns: 0,
+                });
+            }
+        }
+        candidates
+    }
+
+    /// Gives each job to the device with the earliest estimated finish.
+    fn list_schedule(
+        &mut self,
+        now: Instant,
+        id: AppId,
+        wants: &[Want],
+        mut candidates: Vec<Candidate>,
+    ) -> Vec<Candidate> {
+        let Some(app) = self.apps.get_mut(&id) else { return candidates };
+        for want in wants {
+            let Some(job) = app.jobs.get_mut(&want.key) else { continue };
+            let load = want.load_ns as f64;
+            let Some(chosen) = earliest_finish(&mut candidates, load, want.avoid) else { continue };
+            let attempt = Attempt { epoch: self.config.epoch, sequence: self.next_attempt };
+            self.next_attempt += 1;
+            chosen.free_at += load * chosen.time_per_load;
+            chosen.load_ns += u128::from(want.load_ns);
+            chosen.jobs.push(JobAttempt { job: want.key.in_app(id), attempt });
+            job.state = JobState::Placed(Placement {
+                node: chosen.node,
+                device: chosen.device,
+                attempt,
+                planned_at: now,
+                load_ns: want.load_ns,
+            });
+            app.waiting_jobs -= 1;
+            if let Some(batch) = app.batches.get_mut(&job.batch) {
+                batch.told = None;
+            }
+        }
+        candidates
+    }
+
+    /// Books the chosen places on their nodes, and groups them for the application.
+    fn enter_plan(&mut self, candidates: Vec<Candidate>) -> Vec<NodePlan> {
+        let mut plans: Vec<NodePlan> = Vec::new();
+        for candidate in candidates.into_iter().filter(|candidate| !candidate.jobs.is_empty()) {
+            let Some(node) = self.nodes.get_mut(&candidate.node) else { continue };
+            node.jobs.extend(candidate.jobs.iter().map(|job| job.job));
+            if let Some(device) = node.device_mut(candidate.device) {
+                device.queued_ns += candidate.load_ns;
+                device.planned_jobs += candidate.jobs.len() as u64;
+            }
+            let share = DevicePlan { device: candidate.device, jobs: candidate.jobs };
+            match plans.last_mut() {
+                Some(plan) if plan.node == candidate.node => plan.devices.push(share),
+                Some(_) | None => plans.push(NodePlan {
+                    node: candidate.node,
+                    session: node.session,
+                    contact: node.contact.clone(),
+                    devices: vec![share],
+                }),
+            }
+        }
+        plans
+    }
+
+    fn node_plan(&self, id: NodeId, devices: BTreeMap<DeviceIndex, Vec<JobAttempt>>) -> Option<NodePlan> {
+        let node = self.nodes.get(&id)?;
+        let devices = devices.into_iter().map(|(device, jobs)| DevicePlan { device, jobs }).collect();
+        Some(NodePlan { node: id, session: node.session, contact: node.contact.clone(), devices })
+    }
+
+    fn say_waiting(&mut self, id: AppId, batch: BatchId) {
+        let reason = if self.nodes.is_empty() { WaitReason::NoNode } else { WaitReason::NoFittingDevice };
+        let Some(app) = self.apps.get_mut(&id).filter(|app| app.link.is_some()) else { return };
+        let Some(waiting) = app.batches.get_mut(&batch) else { return };
+        if waiting.told.replace(reason) != Some(reason) {
+            self.tell_app(id, CoordinatorToApp::Waiting { batch, reason });
+        }
+    }
+
+    /// Takes the waiting jobs of a batch out of the queues.
+    fn withdraw_pending(&mut self, id: AppId, batch: BatchId) -> Vec<JobKey> {
+        let mut keys = Vec::new();
+        for queue in [&mut self.fresh, &mut self.stuck] {
+            queue.retain_mut(|pending| {
+                let asked = pending.app == id && pending.batch == batch;
+                if asked {
+                    keys.append(&mut pending.keys);
+                }
+                !asked
+            });
+        }
+        let Some(app) = self.apps.get_mut(&id) else { return Vec::new() };
+        if let Some(waiting) = app.batches.get_mut(&batch) {
+            waiting.told = None;
+        }
+        keys.retain(|key| app.jobs.get(key).is_some_and(|job| job.state == JobState::Waiting));
+        keys
+    }
+}
+
+/// A job to be placed.
+struct Want {
+    key: JobKey,
+    load_ns: u64,
+    avoid: Option<NodeId>,
+}
+
+/// A device that may take jobs, and what it got so far. Times are in nanoseconds from now.
+struct Candidate {
+    node: NodeId,
+    device: DeviceIndex,
+    free_at: f64,
+    time_per_load: f64,
+    jobs: Vec<JobAttempt>,
+    load_ns: u128,
+}
+
+/// What a plan request consists of, seen from what is known.
+#[derive(Default)]
+struct Intake {
+    known_batch: bool,
+    fresh: Vec<JobKey>,
+    placed: Vec<JobKey>,
+    failed: Vec<JobKey>,
+}
+
+/// Enters the jobs of a request that are new; a repeated request (after a reconnect) changes nothing.
+fn take_in(app: &mut App, request: &PlanRequest) -> Intake {
+    let mut intake = Intake { known_batch: app.batches.contains_key(&request.batch), ..Intake::default() };
+    for planned in &request.jobs {
+        let key = JobKey { task: request.task, index: planned.index };
+        if app.failed.contains_key(&key) {
+            intake.failed.push(key);
+            continue;
+        }
+        match app.jobs.get(&key).map(|job| job.state) {
+            Some(JobState::Placed(_)) => intake.placed.push(key),
+            Some(JobState::Waiting | JobState::Executed { .. }) => {}
+            None => {
+                let (batch, cost) = (request.batch, planned.cost);
+                app.jobs.insert(key, Job { batch, cost, state: JobState::Waiting, crashes: 0, avoid: None });
+                intake.fresh.push(key);
+            }
+        }
+    }
+    if let Ok(added @ 1..) = u32::try_from(intake.fresh.len()) {
+        app.waiting_jobs += u64::from(added);
+        let new = || Batch { needs: request.needs, open_jobs: 0, told: None };
+        app.batches.entry(request.batch).or_insert_with(new).open_jobs += added;
+    }
+    intake
+}
+
+/// The jobs among `keys` that still wait, with their loads: a job of unknown cost counts as much as the mean of the known ones.
+fn wanted(app: &App, keys: &[JobKey]) -> Vec<Want> {
+    let mut wants = Vec::with_capacity(keys.len());
+    let mut known = 0_u64;
+    let mut known_ns = 0_u128;
+    for &key in keys {
+        let Some(job) = app.jobs.get(&key).filter(|job| job.state == JobState::Waiting) else { continue };
+        let load_ns = job.cost.0.min(MAX_LOAD_NS);
+        if job.cost != CostNs(0) {
+            known += 1;
+            known_ns += u128::from(load_ns);
+        }
+        wants.push(Want { key, load_ns, avoid: job.avoid });
+    }
+    let mean_ns = known_ns.checked_div(u128::from(known)).and_then(|mean| u64::try_from(mean).ok());
+    let unknown_ns = mean_ns.unwrap_or(UNIT_LOAD_NS);
+    for want in wants.iter_mut().filter(|want| want.load_ns == 0) {
+        want.load_ns = unknown_ns;
+    }
+    wants
+}
+
+/// The device that would finish a job first; one on another node than `avoid` wherever there is one.
+///
+/// A scan, not a heap: with unequal loads and rates the order of finishes differs from job to job. The scan reads two
+/// numbers per device; see `farm-core/tests/placement_cost.rs` for what it costs at 1,000 devices.
+fn earliest_finish(candidates: &mut [Candidate], load: f64, avoid: Option<NodeId>) -> Option<&mut Candidate> {
+    let finish = |candidate: &Candidate| candidate.free_at + load * candidate.time_per_load;
+    let mut best: Option<(usize, f64)> = None;
+    let mut fallback: Option<(usize, f64)> = None;
+    for (index, candidate) in candidates.iter().enumerate() {
+        let finish = finish(candidate);
+        let slot = if avoid == Some(candidate.node) { &mut fallback } else { &mut best };
+        if slot.is_none_or(|(_, earliest)| finish < earliest) {
+            *slot = Some((index, finish));
+        }
+    }
+    best.or(fallback).and_then(|(index, _)| candidates.get_mut(index))
+}

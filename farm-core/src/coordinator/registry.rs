@@ -1,0 +1,340 @@
+//! Who is there: hellos, goodbyes, closed connections, draining. Ids are issued here, once each.
+
+use std::{
+    collections::{BTreeMap, BTreeSet},
+    time::Duration,
+};
+
+use super::{
+    CoordinatorMachine, Effect, NodeState,
+    model::{App, Device, Node, Peer},
+    replan::Blame,
+};
+use crate::{
+    device::DeviceInfo,
+    id::{AppId, AppIncarnation, DeviceIndex, LinkId, NodeId},
+    message::{AppHello, CoordinatorToApp, CoordinatorToNode, NodeHello, PROTOCOL_VERSION},
+    time::Instant,
+};
+
+/// Most registered applications; a further one is refused.
+const MAX_APPS: usize = 16_384;
+
+/// Most node names ever seen in one life of the coordinator; a further one is refused.
+const MAX_NODE_NAMES: usize = 65_536;
+
+/// Most devices of one node.
+const MAX_DEVICES: usize = 1_024;
+
+/// Smallest score of a device, in GFLOP/s.
+const MIN_SCORE: f64 = 1e-6;
+
+/// Largest score of a device, in GFLOP/s.
+const MAX_SCORE: f64 = 1e12;
+
+/// Longest name, in bytes.
+const MAX_NAME_BYTES: usize = 256;
+
+/// Ids of one epoch start above those of all earlier ones, so that none is ever issued twice.
+const EPOCH_SHIFT: u32 = 32;
+
+impl CoordinatorMachine {
+    pub(super) fn app_hello(&mut self, now: Instant, link: LinkId, hello: AppHello) {
+        match self.admit_app(&hello) {
+            Err(reason) => {
+                self.effects.push_back(Effect::ToApp { link, message: CoordinatorToApp::Refused { reason } });
+                self.effects.push_back(Effect::Close { link });
+            }
+            Ok(Admission::Back(app)) => self.app_comes_back(now, link, app),
+            Ok(Admission::New(app, incarnation)) => self.app_joins(now, link, app, incarnation, hello),
+        }
+    }
+
+    pub(super) fn node_hello(&mut self, now: Instant, link: LinkId, hello: NodeHello) {
+        if let Err(reason) = self.admit_node(&hello) {
+            self.effects.push_back(Effect::ToNode { link, message: CoordinatorToNode::Refused { reason } });
+            self.effects.push_back(Effect::Close { link });
+            return;
+        }
+        let id = self.node_id(&hello.name);
+        let same_session = self.nodes.get(&id).map(|node| node.session == hello.session);
+        match same_session {
+            Some(true) => {
+                if let Some(old) = self.nodes.get_mut(&id).and_then(|node| node.link.take()) {
+                    self.close(old);
+                }
+            }
+            Some(false) => self.fence(now, id, &hello),
+            None => self.add_node(now, id, &hello),
+        }
+        let Some(node) = self.nodes.get_mut(&id) else { return };
+        node.link = Some(link);
+        node.last_heard = now;
+        node.full_until = None;
+        node.contact = hello.contact;
+        let draining = node.state == NodeState::Draining;
+        if !draining {
+            node.state = NodeState::Alive;
+        }
+        self.links.insert(link, Peer::Node(id));
+        self.arm(now.after(Duration::from_millis(self.config.liveness.suspect_ms)));
+        self.tell_node(
+            id,
+            CoordinatorToNode::Welcome { node: id, epoch: self.config.epoch, liveness: self.config.liveness },
+        );
+        let apps: Vec<(AppId, f64)> = self.apps.iter().map(|(&app, known)| (app, known.weight)).collect();
+        for (app, weight) in apps {
+            self.tell_node(id, CoordinatorToNode::AppJoined { app, weight });
+        }
+        if draining {
+            self.tell_node(id, CoordinatorToNode::Drain);
+        }
+        self.reconcile(now, id, &hello.inventory);
+        self.retry_stuck();
+        tracing::info!(node = %id, name = hello.name, session = %hello.session, "node registered");
+    }
+
+    pub(super) fn link_closed(&mut self, now: Instant, link: LinkId) {
+        match self.links.remove(&link) {
+            None => {}
+            Some(Peer::App(app)) => self.app_away(now, app),
+            Some(Peer::Node(node)) => self.node_away(now, node),
+        }
+    }
+
+    /// A peer that does not keep to the protocol loses its connection, as if it had closed it.
+    pub(super) fn protocol_error(&mut self, now: Instant, link: LinkId) {
+        tracing::warn!(%link, "message out of turn, closing");
+        self.link_closed(now, link);
+        self.effects.push_back(Effect::Close { link });
+    }
+
+    /// An application that asks for more than it may have is out, with everything it has.
+    pub(super) fn expel_app(&mut self, app: AppId, reason: String) {
+        tracing::warn!(%app, reason, "application expelled");
+        self.tell_app(app, CoordinatorToApp::Refused { reason });
+        if let Some(link) = self.apps.get(&app).and_then(|app| app.link) {
+            self.close(link);
+        }
+        self.app_leaves(app);
+    }
+
+    /// The application is gone: everything of it is freed, here and on the nodes.
+    pub(super) fn app_leaves(&mut self, id: AppId) {
+        let Some(app) = self.apps.remove(&id) else { return };
+        for (key, job) in app.jobs {
+            self.release(id, key, job.state);
+        }
+        self.forget_pending(|pending| pending.app == id);
+        let nodes: Vec<NodeId> = self.nodes.keys().copied().collect();
+        for node in nodes {
+            self.tell_node(node, CoordinatorToNode::AppLeft { app: id });
+        }
+        tracing::info!(app = %id, "application left");
+    }
+
+    /// A drained node says goodbye: it should hold nothing; what it still holds here was never its fault.
+    pub(super) fn node_leaves(&mut self, now: Instant, id: NodeId) {
+        self.remove_node(now, id, Blame::Nobody);
+        tracing::info!(node = %id, "node left");
+    }
+
+    pub(super) fn drain(&mut self, id: NodeId) {
+        let Some(node) = self.nodes.get_mut(&id) else { return };
+        node.state = NodeState::Draining;
+        self.tell_node(id, CoordinatorToNode::Drain);
+    }
+
+    fn admit_app(&self, hello: &AppHello) -> Result<Admission, String> {
+        check_protocol(hello.protocol)?;
+        check_name(&hello.name)?;
+        if !(hello.weight.is_finite() && hello.weight > 0.0) {
+            return Err(format!("weight {} must be positive and finite", hello.weight));
+        }
+        if let Some((app, incarnation)) = hello.resume {
+            return match self.apps.get(&app) {
+                Some(known) if known.incarnation == incarnation => Ok(Admission::Back(app)),
+                Some(known) => Err(format!("{app} {incarnation} is over, {} is there", known.incarnation)),
+                // Its lease ran out, or an earlier coordinator knew it: it keeps its name, its jobs are asked for anew.
+                None if self.issued(app) => {
+                    Ok(Admission::New(app, AppIncarnation(incarnation.0.saturating_add(1))))
+                }
+                None => Err(format!("{app} was never registered")),
+            };
+        }
+        if self.apps.len() >= MAX_APPS {
+            return Err(format!("{MAX_APPS} applications are registered already"));
+        }
+        Ok(Admission::New(AppId(self.epoch_base() + u64::from(self.next_app)), AppIncarnation(1)))
+    }
+
+    fn admit_node(&self, hello: &NodeHello) -> Result<(), String> {
+        check_protocol(hello.protocol)?;
+        check_name(&hello.name)?;
+        if hello.devices.is_empty() || hello.devices.len() > MAX_DEVICES {
+            return Err(format!("{} devices: 1..={MAX_DEVICES} are allowed", hello.devices.len()));
+        }
+        for (index, device) in hello.devices.iter().enumerate() {
+            check_device(index, device)?;
+        }
+        let known = self.names.get(&hello.name).and_then(|id| self.nodes.get(id));
+        if known
+            .is_some_and(|node| node.session == hello.session && node.devices.len() != hello.devices.len())
+        {
+            return Err(format!("{} came back with other devices", hello.session));
+        }
+        if !self.names.contains_key(&hello.name) && self.names.len() >= MAX_NODE_NAMES {
+            return Err(format!("{MAX_NODE_NAMES} node names are known already"));
+        }
+        Ok(())
+    }
+
+    fn app_joins(
+        &mut self,
+        now: Instant,
+        link: LinkId,
+        id: AppId,
+        incarnation: AppIncarnation,
+        hello: AppHello,
+    ) {
+        if hello.resume.is_none() {
+            self.next_app += 1;
+        }
+        let app = App {
+            name: hello.name,
+            weight: hello.weight,
+            incarnation,
+            link: Some(link),
+            last_heard: now,
+            lease_until: now,
+            batches: BTreeMap::new(),
+            jobs: BTreeMap::new(),
+            failed: BTreeMap::new(),
+            unreachable: BTreeMap::new(),
+            waiting_jobs: 0,
+            delivered_jobs: 0,
+            device_time_ns: 0,
+        };
+        tracing::info!(app = %id, name = app.name, "application registered");
+        self.apps.insert(id, app);
+        self.links.insert(link, Peer::App(id));
+        self.welcome_app(now, id);
+        let nodes: Vec<NodeId> = self.nodes.keys().copied().collect();
+        for node in nodes {
+            self.tell_node(node, CoordinatorToNode::AppJoined { app: id, weight: hello.weight });
+        }
+    }
+
+    /// The connection was broken and stands again: repeats everything that may have been lost with the old one.
+    fn app_comes_back(&mut self, now: Instant, link: LinkId, id: AppId) {
+        let Some(app) = self.apps.get_mut(&id) else { return };
+        app.last_heard = now;
+        if let Some(old) = app.link.replace(link) {
+            self.close(old);
+        }
+        self.links.insert(link, Peer::App(id));
+        self.welcome_app(now, id);
+        self.repeat_failures(id);
+        self.repeat_placements(id);
+        self.retry_stuck();
+    }
+
+    fn welcome_app(&mut self, now: Instant, id: AppId) {
+        let Some(app) = self.apps.get(&id) else { return };
+        let welcome = CoordinatorToApp::Welcome {
+            app: id,
+            incarnation: app.incarnation,
+            epoch: self.config.epoch,
+            liveness: self.config.liveness,
+        };
+        self.tell_app(id, welcome);
+        self.arm(now.after(Duration::from_millis(self.config.liveness.dead_ms)));
+    }
+
+    fn add_node(&mut self, now: Instant, id: NodeId, hello: &NodeHello) {
+        let node = Node {
+            name: hello.name.clone(),
+            session: hello.session,
+            contact: hello.contact.clone(),
+            devices: hello.devices.iter().cloned().map(Device::new).collect(),
+            link: None,
+            last_heard: now,
+            state: NodeState::Alive,
+            full_until: None,
+            recheck: None,
+            jobs: BTreeSet::new(),
+        };
+        self.nodes.insert(id, node);
+    }
+
+    /// A second life of a node's name: the first is over at once. Jobs that the new one brought along stay with it.
+    fn fence(&mut self, now: Instant, id: NodeId, hello: &NodeHello) {
+        if let Some(link) = self.nodes.get(&id).and_then(|node| node.link) {
+            let reason = format!("{} of the same name took over", hello.session);
+            self.effects.push_back(Effect::ToNode { link, message: CoordinatorToNode::Refused { reason } });
+            self.close(link);
+        }
+        let kept = self.inherited(id, hello);
+        self.remove_node(now, id, Blame::OldestOnEachDevice);
+        self.add_node(now, id, hello);
+        self.inherit(id, &kept);
+    }
+
+    fn node_id(&mut self, name: &str) -> NodeId {
+        if let Some(&id) = self.names.get(name) {
+            return id;
+        }
+        let id = NodeId(self.epoch_base() + u64::from(self.next_node));
+        self.next_node += 1;
+        self.names.insert(name.to_owned(), id);
+        id
+    }
+
+    /// The largest id that earlier epochs can have issued.
+    pub(super) fn issued_before(&self) -> u64 {
+        self.epoch_base()
+    }
+
+    fn epoch_base(&self) -> u64 {
+        u64::from(self.config.epoch.0.saturating_sub(1)) << EPOCH_SHIFT
+    }
+
+    /// Whether an application id was issued by this or an earlier coordinator.
+    fn issued(&self, app: AppId) -> bool {
+        app.0 != 0 && app.0 < self.epoch_base() + u64::from(self.next_app)
+    }
+}
+
+/// How an application's hello is taken.
+enum Admission {
+    /// Registered and known.
+    Back(AppId),
+    /// Nothing is known of it here.
+    New(AppId, AppIncarnation),
+}
+
+fn check_protocol(protocol: u32) -> Result<(), String> {
+    if protocol == PROTOCOL_VERSION {
+        return Ok(());
+    }
+    Err(format!("protocol version {protocol} is not spoken here, version {PROTOCOL_VERSION} is"))
+}
+
+fn check_name(name: &str) -> Result<(), String> {
+    if name.len() <= MAX_NAME_BYTES {
+        return Ok(());
+    }
+    Err(format!("a name of {} bytes is longer than {MAX_NAME_BYTES}", name.len()))
+}
+
+fn check_device(index: usize, device: &DeviceInfo) -> Result<(), String> {
+    let index = u16::try_from(index).map(DeviceIndex).map_err(|error| error.to_string())?;
+    // A range, not just "positive": rates derived from it stay far from the ends of f64.
+    if (MIN_SCORE..=MAX_SCORE).contains(&device.score) {
+        return Ok(());
+    }
+    Err(format!(
+        "{index} ({}): score {} is not in {MIN_SCORE}..={MAX_SCORE} GFLOP/s",
+        device.name, device.score
+    ))
+}

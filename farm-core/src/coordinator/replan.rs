@@ -1,0 +1,326 @@
+//! What was lost, given up or withdrawn: jobs lose their place here, and get into line for a new one or leave.
+
+use std::{
+    collections::{BTreeMap, BTreeSet},
+    time::Duration,
+};
+
+use super::{
+    CoordinatorMachine, NodeState,
+    model::{Job, JobState, Recheck},
+};
+use crate::{
+    id::{AppId, Attempt, DeviceIndex, JobAttempt, JobId, JobKey, NodeId, NodeSession, TaskId},
+    message::{CoordinatorToApp, CoordinatorToNode, JobFailure, NodeHello},
+    time::Instant,
+};
+
+/// How long a node stays out of an application's plans after the application could not reach it, in milliseconds.
+const UNREACHABLE_MS: u64 = 60_000;
+
+/// Most failures of one application that are remembered for repetition; beyond it the smallest ids are forgotten.
+const MAX_REMEMBERED_FAILURES: usize = 4_096;
+
+/// On each device a node runs one job and has staged one: only these can have brought it down.
+const SUSPECT_JOBS_PER_DEVICE: usize = 2;
+
+/// Whose crash the loss of a node counts as.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Blame {
+    /// It was a partition, or the node left in good order.
+    Nobody,
+    /// The process died: of the jobs that must have been on a device then, the oldest of each application on it.
+    OldestOnEachDevice,
+}
+
+impl CoordinatorMachine {
+    /// Removes a node; its undelivered jobs get into line for new attempts.
+    pub(super) fn remove_node(&mut self, now: Instant, id: NodeId, blame: Blame) {
+        let Some(node) = self.nodes.remove(&id) else { return };
+        if let Some(link) = node.link {
+            self.close(link);
+        }
+        for app in self.apps.values_mut() {
+            app.unreachable.remove(&id);
+        }
+        let blamed = match blame {
+            Blame::Nobody => BTreeSet::new(),
+            Blame::OldestOnEachDevice => self.oldest_jobs(&node.jobs),
+        };
+        tracing::warn!(node = %id, %now, jobs = node.jobs.len(), "node lost");
+        for job in node.jobs {
+            if blamed.contains(&job) {
+                self.crashed(job, JobFailure::DeviceLost(format!("{id} was lost")), id);
+            } else {
+                self.requeue(job, Some(id));
+            }
+        }
+    }
+
+    /// Compares what a node says it holds with what it should hold.
+    pub(super) fn reconcile(&mut self, now: Instant, id: NodeId, inventory: &[JobAttempt]) {
+        let Some(node) = self.nodes.get(&id) else { return };
+        let held: BTreeMap<JobId, Attempt> = inventory.iter().map(|item| (item.job, item.attempt)).collect();
+        let mut doubtful = Vec::new();
+        for &job in &node.jobs {
+            let Some((_, attempt)) = self.holder(job) else { continue };
+            if held.get(&job) != Some(&attempt) {
+                doubtful.push((job, attempt));
+            }
+        }
+        // The report that explains it, or the job itself, may still be on its way: wait as long as for a silent node.
+        if !doubtful.is_empty() {
+            let at = now.after(Duration::from_millis(self.config.liveness.dead_ms));
+            if let Some(node) = self.nodes.get_mut(&id) {
+                node.recheck = Some(Recheck { at, jobs: doubtful });
+            }
+            self.arm(at);
+        }
+        let mut stale = Vec::new();
+        let mut left: BTreeSet<AppId> = BTreeSet::new();
+        for item in inventory {
+            match self.apps.get(&item.job.app) {
+                None => {
+                    left.insert(item.job.app);
+                }
+                Some(_) if self.holder(item.job) != Some((id, item.attempt)) => stale.push(*item),
+                Some(_) => {}
+            }
+        }
+        if !stale.is_empty() {
+            self.tell_node(id, CoordinatorToNode::Cancel { jobs: stale });
+        }
+        // Applications of an earlier coordinator may come back to this one; those of our own epoch are gone.
+        let issued_before = self.issued_before();
+        for app in left.into_iter().filter(|app| app.0 > issued_before) {
+            self.tell_node(id, CoordinatorToNode::AppLeft { app });
+        }
+    }
+
+    /// The deadline of [`Recheck`]: what is still unexplained gets a new attempt.
+    pub(super) fn recheck(&mut self, id: NodeId, recheck: Recheck) {
+        let mut cancelled = Vec::new();
+        for (job, attempt) in recheck.jobs {
+            if self.holder(job) == Some((id, attempt)) {
+                cancelled.push(JobAttempt { job, attempt });
+                self.requeue(job, None);
+            }
+        }
+        if !cancelled.is_empty() {
+            self.tell_node(id, CoordinatorToNode::Cancel { jobs: cancelled });
+        }
+    }
+
+    /// Jobs of a node's earlier life that its new one brought along, taken off the earlier one's books.
+    pub(super) fn inherited(&mut self, id: NodeId, hello: &NodeHello) -> Vec<JobId> {
+        let mut kept = Vec::new();
+        for item in &hello.inventory {
+            let holder = self.job(item.job).map(|job| job.state);
+            let fits = match holder {
+                Some(JobState::Placed(place)) => usize::from(place.device.0) < hello.devices.len(),
+                Some(JobState::Executed { .. }) => true,
+                Some(JobState::Waiting) | None => false,
+            };
+            if fits && self.holder(item.job) == Some((id, item.attempt)) {
+                let Some(node) = self.nodes.get_mut(&id) else { break };
+                if node.jobs.remove(&item.job) {
+                    kept.push(item.job);
+                }
+            }
+        }
+        kept
+    }
+
+    /// Books inherited jobs on the new life of their node, and tells their applications.
+    pub(super) fn inherit(&mut self, id: NodeId, kept: &[JobId]) {
+        let mut by_app: BTreeMap<AppId, Vec<JobKey>> = BTreeMap::new();
+        for &job in kept {
+            let state = self.job(job).map(|job| job.state);
+            let Some(node) = self.nodes.get_mut(&id) else { return };
+            node.jobs.insert(job);
+            if let Some(JobState::Placed(place)) = state
+                && let Some(device) = node.device_mut(place.device)
+            {
+                device.add_load(place.load_ns);
+                by_app.entry(job.app).or_default().push(JobKey::of(job));
+            }
+        }
+        for (app, keys) in by_app {
+            self.repeat_plan(app, None, &keys);
+        }
+    }
+
+    /// An application cannot reach a node: its jobs move off it.
+    pub(super) fn unreachable(&mut self, now: Instant, app: AppId, id: NodeId, session: NodeSession) {
+        let Some(node) = self.nodes.get(&id).filter(|node| node.session == session) else { return };
+        let jobs: Vec<JobId> = node.jobs.range(JobId::range_of(app)).copied().collect();
+        let until = now.after(Duration::from_millis(UNREACHABLE_MS));
+        if let Some(app) = self.apps.get_mut(&app) {
+            app.unreachable.insert(id, until);
+            self.arm(until);
+        }
+        self.move_off(id, jobs);
+    }
+
+    /// The application has results of these jobs already (or gave them up): nothing further is owed.
+    pub(super) fn already_delivered(&mut self, app: AppId, jobs: &[JobId]) {
+        for job in jobs.iter().filter(|job| job.app == app) {
+            self.forget_job(*job);
+        }
+    }
+
+    /// The application gives a task up.
+    pub(super) fn cancel_task(&mut self, id: AppId, task: TaskId) {
+        let Some(app) = self.apps.get(&id) else { return };
+        let jobs: Vec<JobId> =
+            app.jobs.range(JobKey::range_of(task)).map(|(key, _)| key.in_app(id)).collect();
+        let mut on_nodes: BTreeMap<NodeId, Vec<JobAttempt>> = BTreeMap::new();
+        for job in jobs {
+            if let Some((node, attempt)) = self.holder(job) {
+                on_nodes.entry(node).or_default().push(JobAttempt { job, attempt });
+            }
+            self.forget_job(job);
+        }
+        self.forget_pending(|pending| pending.app == id && pending.task == task);
+        for (node, jobs) in on_nodes {
+            self.tell_node(node, CoordinatorToNode::Cancel { jobs });
+        }
+    }
+
+    /// An attempt ended with its device or node: a new one follows, unless there were too many.
+    pub(super) fn crashed(&mut self, id: JobId, failure: JobFailure, node: NodeId) {
+        let max_crashes = self.config.max_crashes;
+        let Some(job) = self.job_mut(id) else { return };
+        job.crashes = job.crashes.saturating_add(1);
+        if job.crashes >= max_crashes {
+            let reason = format!(
+                "{} attempts ended with their device or node, the last one on {node}: {failure:?}",
+                job.crashes
+            );
+            self.fail_job(id, JobFailure::Poison(reason));
+        } else {
+            self.requeue(id, Some(node));
+        }
+    }
+
+    /// Takes a job off its place and puts it into line for a new attempt.
+    pub(super) fn requeue(&mut self, id: JobId, avoid: Option<NodeId>) {
+        let Some(app) = self.apps.get_mut(&id.app) else { return };
+        let key = JobKey::of(id);
+        let Some(job) = app.jobs.get_mut(&key) else { return };
+        let before = std::mem::replace(&mut job.state, JobState::Waiting);
+        if before == JobState::Waiting {
+            return;
+        }
+        job.avoid = avoid;
+        app.waiting_jobs += 1;
+        self.lost.entry((id.app, job.batch)).or_default().push(key);
+        self.release(id.app, key, before);
+    }
+
+    /// Takes what a job occupies off the books of its node.
+    pub(super) fn release(&mut self, app: AppId, key: JobKey, state: JobState) {
+        let Some((id, _)) = state.holder() else { return };
+        // A node that is gone took its books along.
+        let Some(node) = self.nodes.get_mut(&id) else { return };
+        node.jobs.remove(&key.in_app(app));
+        if let JobState::Placed(place) = state
+            && let Some(device) = node.device_mut(place.device)
+        {
+            device.drop_load(place.load_ns);
+        }
+    }
+
+    /// A job is over, or nobody wants it any more.
+    pub(super) fn forget_job(&mut self, id: JobId) -> Option<Job> {
+        let app = self.apps.get_mut(&id.app)?;
+        let key = JobKey::of(id);
+        let job = app.jobs.remove(&key)?;
+        if job.state == JobState::Waiting {
+            app.waiting_jobs -= 1;
+        }
+        let mut batch_over = false;
+        if let Some(batch) = app.batches.get_mut(&job.batch) {
+            batch.open_jobs -= 1;
+            if batch.open_jobs == 0 {
+                app.batches.remove(&job.batch);
+                batch_over = true;
+            }
+        }
+        if batch_over && job.state == JobState::Waiting {
+            let batch = job.batch;
+            self.forget_pending(|pending| pending.app == id.app && pending.batch == batch);
+        }
+        self.release(id.app, key, job.state);
+        Some(job)
+    }
+
+    /// Says again which jobs were given up.
+    pub(super) fn repeat_failures(&mut self, id: AppId) {
+        let Some(app) = self.apps.get(&id) else { return };
+        let keys: Vec<JobKey> = app.failed.keys().copied().collect();
+        keys.into_iter().for_each(|key| self.repeat_failure(id, key));
+    }
+
+    pub(super) fn repeat_failure(&mut self, id: AppId, key: JobKey) {
+        let Some(failure) = self.apps.get(&id).and_then(|app| app.failed.get(&key)).cloned() else { return };
+        self.tell_app(id, CoordinatorToApp::JobFailed { job: key.in_app(id), failure });
+    }
+
+    /// Node and attempt that answer for a job.
+    pub(super) fn holder(&self, id: JobId) -> Option<(NodeId, Attempt)> {
+        self.job(id).and_then(|job| job.state.holder())
+    }
+
+    /// Whether the node drains: jobs that it gives back are no sign of a full queue.
+    pub(super) fn drains(&self, id: NodeId) -> bool {
+        self.nodes.get(&id).is_some_and(|node| node.state == NodeState::Draining)
+    }
+
+    pub(super) fn job_mut(&mut self, id: JobId) -> Option<&mut Job> {
+        self.apps.get_mut(&id.app)?.jobs.get_mut(&JobKey::of(id))
+    }
+
+    fn job(&self, id: JobId) -> Option<&Job> {
+        self.apps.get(&id.app)?.jobs.get(&JobKey::of(id))
+    }
+
+    fn fail_job(&mut self, id: JobId, failure: JobFailure) {
+        self.forget_job(id);
+        let key = JobKey::of(id);
+        let Some(app) = self.apps.get_mut(&id.app) else { return };
+        if app.failed.len() >= MAX_REMEMBERED_FAILURES {
+            app.failed.pop_first();
+        }
+        app.failed.insert(key, failure);
+        self.repeat_failure(id.app, key);
+    }
+
+    /// Takes jobs off a node that still stands.
+    fn move_off(&mut self, id: NodeId, jobs: Vec<JobId>) {
+        let mut cancelled = Vec::with_capacity(jobs.len());
+        for job in jobs {
+            if let Some((_, attempt)) = self.holder(job) {
+                cancelled.push(JobAttempt { job, attempt });
+            }
+            self.requeue(job, Some(id));
+        }
+        if !cancelled.is_empty() {
+            self.tell_node(id, CoordinatorToNode::Cancel { jobs: cancelled });
+        }
+    }
+
+    /// The jobs that may have been on a device when their node died.
+    fn oldest_jobs(&self, jobs: &BTreeSet<JobId>) -> BTreeSet<JobId> {
+        let mut queues: BTreeMap<(AppId, DeviceIndex), BTreeMap<Attempt, JobId>> = BTreeMap::new();
+        for &id in jobs {
+            let Some(JobState::Placed(place)) = self.job(id).map(|job| job.state) else { continue };
+            let oldest = queues.entry((id.app, place.device)).or_default();
+            oldest.insert(place.attempt, id);
+            if oldest.len() > SUSPECT_JOBS_PER_DEVICE {
+                oldest.pop_last();
+            }
+        }
+        queues.into_values().flat_map(BTreeMap::into_values).collect()
+    }
+}

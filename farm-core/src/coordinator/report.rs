@@ -1,0 +1,120 @@
+//! What nodes say of their work: executed, delivered, loads, lost devices.
+
+use std::time::Duration;
+
+use super::{CoordinatorMachine, model::JobState};
+use crate::{
+    id::{DeviceIndex, JobAttempt, NodeId},
+    message::{DeviceLoad, Executed, JobFailure},
+    time::Instant,
+};
+
+/// How long a node that gave a job back, though it does not drain, gets nothing new, in milliseconds.
+const FULL_MS: u64 = 1_000;
+
+impl CoordinatorMachine {
+    pub(super) fn reported(
+        &mut self,
+        now: Instant,
+        node: NodeId,
+        executed: Vec<Executed>,
+        delivered: &[JobAttempt],
+    ) {
+        for ended in executed {
+            self.executed(now, node, ended);
+        }
+        for &job in delivered {
+            self.delivered(node, job);
+        }
+    }
+
+    pub(super) fn loads_reported(&mut self, id: NodeId, loads: &[DeviceLoad]) {
+        let Some(node) = self.nodes.get_mut(&id) else { return };
+        for (device, load) in node.devices.iter_mut().zip(loads) {
+            device.running_jobs = load.running_jobs;
+        }
+    }
+
+    pub(super) fn device_lost(&mut self, id: NodeId, device: DeviceIndex, reason: &str) {
+        tracing::warn!(node = %id, %device, reason, "device lost");
+        let Some(node) = self.nodes.get_mut(&id) else { return };
+        if let Some(device) = node.device_mut(device) {
+            device.lost = true;
+            device.running_jobs = 0;
+        }
+    }
+
+    fn executed(&mut self, now: Instant, node: NodeId, ended: Executed) {
+        let Executed { job: JobAttempt { job: id, attempt }, device, device_time_ns, failure } = ended;
+        // Reports of attempts that were replaced meanwhile change nothing.
+        if self.holder(id) != Some((node, attempt)) {
+            return;
+        }
+        match failure {
+            None => {
+                if let Some(load_ns) = self.device_freed(node, JobAttempt { job: id, attempt }) {
+                    self.account(node, device, JobAttempt { job: id, attempt }, load_ns, device_time_ns);
+                }
+            }
+            Some(JobFailure::Returned) => {
+                if !self.drains(node) {
+                    self.node_full(now, node);
+                }
+                self.requeue(id, Some(node));
+            }
+            Some(failure) if failure.can_be_retried() => self.crashed(id, failure, node),
+            // Its application gets this failure from the node, as a result; nothing else is owed.
+            Some(_) => {
+                self.device_freed(node, JobAttempt { job: id, attempt });
+            }
+        }
+    }
+
+    fn delivered(&mut self, node: NodeId, job: JobAttempt) {
+        if self.holder(job.job) != Some((node, job.attempt)) {
+            return;
+        }
+        self.forget_job(job.job);
+        self.delivered_jobs += 1;
+        if let Some(app) = self.apps.get_mut(&job.job.app) {
+            app.delivered_jobs += 1;
+        }
+    }
+
+    /// The job left its device. Returns its load the first time it is told.
+    fn device_freed(&mut self, id: NodeId, job: JobAttempt) -> Option<u64> {
+        let record = self.job_mut(job.job)?;
+        let JobState::Placed(place) = record.state else { return None };
+        record.state = JobState::Executed { node: id, attempt: job.attempt };
+        let device = self.nodes.get_mut(&id)?.device_mut(place.device)?;
+        device.drop_load(place.load_ns);
+        Some(place.load_ns)
+    }
+
+    /// Charges a completed job, and learns from it, on the device that ran it (a local steal may have moved it).
+    fn account(
+        &mut self,
+        id: NodeId,
+        device: DeviceIndex,
+        job: JobAttempt,
+        load_ns: u64,
+        device_time_ns: u64,
+    ) {
+        if let Some(device) = self.nodes.get_mut(&id).and_then(|node| node.device_mut(device)) {
+            device.executed_jobs += 1;
+            device.device_time_ns = device.device_time_ns.saturating_add(device_time_ns);
+            device.completed(&mut self.calibration, load_ns, device_time_ns);
+        }
+        if let Some(app) = self.apps.get_mut(&job.job.app) {
+            app.device_time_ns = app.device_time_ns.saturating_add(device_time_ns);
+        }
+    }
+
+    fn node_full(&mut self, now: Instant, id: NodeId) {
+        let until = now.after(Duration::from_millis(FULL_MS));
+        if let Some(node) = self.nodes.get_mut(&id) {
+            node.full_until = Some(until);
+            self.arm(until);
+        }
+    }
+}

@@ -1,0 +1,64 @@
+//! The farm as operators see it. It reads, and changes nothing.
+
+use super::{AppStatus, CoordinatorMachine, DeviceStatus, FarmStatus, NodeStatus};
+use crate::id::DeviceIndex;
+
+impl CoordinatorMachine {
+    /// The farm as an operator sees it.
+    #[must_use]
+    pub fn status(&self) -> FarmStatus {
+        FarmStatus {
+            epoch: self.config.epoch,
+            nodes: self.node_statuses(),
+            apps: self.app_statuses(),
+            delivered_jobs: self.delivered_jobs,
+            replanned_jobs: self.replanned_jobs,
+        }
+    }
+
+    fn node_statuses(&self) -> Vec<NodeStatus> {
+        let devices = |node: &super::model::Node| {
+            (0_u16..)
+                .zip(&node.devices)
+                // A lost device is no device of the farm any more.
+                .filter(|(_, device)| !device.lost)
+                .map(|(index, device)| DeviceStatus {
+                    device: DeviceIndex(index),
+                    name: device.info.name.clone(),
+                    kind: device.info.kind,
+                    score: device.info.score,
+                    planned_jobs: device.planned_jobs,
+                    running_jobs: device.running_jobs,
+                    executed_jobs: device.executed_jobs,
+                    device_time_ns: device.device_time_ns,
+                })
+                .collect()
+        };
+        self.nodes
+            .iter()
+            .map(|(&id, node)| NodeStatus {
+                node: id,
+                name: node.name.clone(),
+                state: node.state,
+                addresses: node.contact.addresses.clone(),
+                devices: devices(node),
+            })
+            .collect()
+    }
+
+    fn app_statuses(&self) -> Vec<AppStatus> {
+        self.apps
+            .iter()
+            .map(|(&id, app)| AppStatus {
+                app: id,
+                name: app.name.clone(),
+                weight: app.weight,
+                connected: app.link.is_some(),
+                waiting_jobs: app.waiting_jobs,
+                outstanding_jobs: app.jobs.len() as u64 - app.waiting_jobs,
+                delivered_jobs: app.delivered_jobs,
+                device_time_ns: app.device_time_ns,
+            })
+            .collect()
+    }
+}

@@ -1,0 +1,250 @@
+//! The ledger's jobs: which are open, which attempt of each counts, which are over. It never says where a job goes.
+
+use super::{Effect, Ledger, SubmittedJob, nodes::NodeLife};
+use crate::{
+    device::Requirements,
+    id::{AppId, Attempt, BatchId, DeviceIndex, JobAttempt, JobId, JobIndex, JobKey, TaskId},
+    message::{CostNs, JobFailure, Plan, Priority, ResultHeader},
+    program::Content,
+    time::Instant,
+};
+
+/// Most jobs in one plan request; a larger submission becomes several.
+pub(super) const MAX_BATCH_JOBS: usize = 4_096;
+
+/// Which attempt of a job counts, and where it is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct Placement {
+    pub(super) attempt: Attempt,
+    pub(super) life: NodeLife,
+    pub(super) device: DeviceIndex,
+}
+
+/// An open job.
+#[derive(Debug)]
+pub(super) struct Job {
+    pub(super) cost: CostNs,
+    pub(super) priority: Priority,
+    pub(super) contents: Vec<Content>,
+    pub(super) batch: BatchId,
+    /// `None` until the first plan.
+    pub(super) place: Option<Placement>,
+}
+
+/// What the jobs of one plan request share.
+#[derive(Debug)]
+pub(super) struct Batch {
+    pub(super) task: TaskId,
+    pub(super) needs: Requirements,
+    /// All of its jobs, in order of submission.
+    pub(super) indices: Vec<JobIndex>,
+    /// Jobs not over.
+    pub(super) open_jobs: u32,
+    /// Open jobs without a plan.
+    pub(super) waiting_jobs: u32,
+    /// The coordinator of this session has been asked.
+    pub(super) requested: bool,
+    /// Ask also for jobs that have a plan: the coordinator lost it.
+    pub(super) ask_all: bool,
+}
+
+impl Ledger {
+    pub(super) fn submitted(&mut self, task: TaskId, jobs: Vec<SubmittedJob>, needs: Requirements) {
+        let mut indices = Vec::with_capacity(jobs.len().min(MAX_BATCH_JOBS));
+        for job in jobs {
+            let key = JobKey { task, index: job.index };
+            if self.jobs.contains_key(&key) || self.over.contains(&key) {
+                tracing::warn!(%task, job = %job.index, "submitted twice, the first one counts");
+                continue;
+            }
+            let SubmittedJob { index, cost, priority, contents } = job;
+            self.jobs
+                .insert(key, Job { cost, priority, contents, batch: BatchId(self.next_batch), place: None });
+            self.counts.waiting_jobs += 1;
+            indices.push(index);
+            if indices.len() == MAX_BATCH_JOBS {
+                self.add_batch(task, needs, std::mem::take(&mut indices));
+            }
+        }
+        if !indices.is_empty() {
+            self.add_batch(task, needs, indices);
+        }
+    }
+
+    pub(super) fn planned(&mut self, now: Instant, plan: Plan) {
+        let Some(app) = self.app() else { return };
+        for node_plan in plan.nodes {
+            let life = NodeLife { node: node_plan.node, session: node_plan.session };
+            let mut attempts = Vec::new();
+            for device_plan in node_plan.devices {
+                let device = device_plan.device;
+                for job in device_plan.jobs.into_iter().filter(|job| job.job.app == app) {
+                    let placement = Placement { attempt: job.attempt, life, device };
+                    attempts.extend(self.place(JobKey::of(job.job), placement));
+                }
+            }
+            if !attempts.is_empty() {
+                self.send_attempts(now, life, node_plan.contact, attempts);
+            }
+        }
+    }
+
+    /// A result's way: the current attempt from the planned node is delivered, anything else is acknowledged (so
+    /// that the node frees it) and dropped.
+    pub(super) fn result(&mut self, life: NodeLife, header: ResultHeader) {
+        let ResultHeader { job, device: _, device_time_ns, outcome, digest } = header;
+        let key = JobKey::of(job.job);
+        self.acknowledge(life, job, digest);
+        let counts = self.app() == Some(job.job.app)
+            && self
+                .jobs
+                .get(&key)
+                .and_then(|job| job.place)
+                .is_some_and(|place| place.attempt == job.attempt && place.life == life);
+        if !counts {
+            self.push(Effect::DropPayload { job, digest });
+            return;
+        }
+        match outcome {
+            Ok(sections) => {
+                self.close(key);
+                self.counts.delivered_jobs += 1;
+                self.push(Effect::Deliver { job, sections, device_time_ns, node: life.node });
+                self.push(Effect::ForgetProgram(job.job));
+            }
+            // The coordinator knows of it and will plan a further attempt.
+            Err(failure) if failure.can_be_retried() => self.push(Effect::DropPayload { job, digest }),
+            Err(failure) => {
+                self.push(Effect::DropPayload { job, digest });
+                self.fail(key, job.job, failure);
+            }
+        }
+    }
+
+    /// The coordinator gave a job up.
+    pub(super) fn given_up(&mut self, job: JobId, failure: JobFailure) {
+        let key = JobKey::of(job);
+        if self.app() == Some(job.app) && self.jobs.contains_key(&key) {
+            self.fail(key, job, failure);
+        }
+    }
+
+    pub(super) fn cancelled(&mut self, task: TaskId) {
+        let keys: Vec<JobKey> = self.jobs.range(JobKey::range_of(task)).map(|(&key, _)| key).collect();
+        if keys.is_empty() {
+            return;
+        }
+        // Before the first registration there is no application id yet; the driver keys programs by task and index.
+        let app = self.app().unwrap_or(AppId(0));
+        for key in keys {
+            if let Some(place) = self.jobs.get(&key).and_then(|job| job.place) {
+                self.cancel_on_node(place.life, JobAttempt { job: key.in_app(app), attempt: place.attempt });
+            }
+            self.fail(key, key.in_app(app), JobFailure::Cancelled);
+        }
+        self.cancel_at_coordinator(task);
+    }
+
+    /// Forgets every placement: the attempts can never be answered.
+    pub(super) fn unplace_all(&mut self) {
+        let keys: Vec<JobKey> =
+            self.jobs.iter().filter(|(_, job)| job.place.is_some()).map(|(&key, _)| key).collect();
+        for key in keys {
+            let Some(job) = self.jobs.get_mut(&key) else { continue };
+            let Some(place) = job.place.take() else { continue };
+            if let Some(batch) = self.batches.get_mut(&job.batch) {
+                batch.waiting_jobs += 1;
+            }
+            self.counts.outstanding_jobs -= 1;
+            self.counts.waiting_jobs += 1;
+            self.leaves_node(place);
+        }
+    }
+
+    pub(super) fn drop_open_jobs(&mut self) {
+        self.jobs.clear();
+        self.batches.clear();
+        self.counts.waiting_jobs = 0;
+        self.counts.outstanding_jobs = 0;
+    }
+
+    fn add_batch(&mut self, task: TaskId, needs: Requirements, indices: Vec<JobIndex>) {
+        let id = BatchId(self.next_batch);
+        self.next_batch += 1;
+        let open_jobs = u32::try_from(indices.len()).expect("a batch holds at most MAX_BATCH_JOBS");
+        let batch = Batch {
+            task,
+            needs,
+            indices,
+            open_jobs,
+            waiting_jobs: open_jobs,
+            requested: false,
+            ask_all: false,
+        };
+        self.batches.insert(id, batch);
+        self.to_request.push_back(id);
+    }
+
+    /// Takes a planned attempt in. Returns it if it must be sent.
+    fn place(&mut self, key: JobKey, placement: Placement) -> Option<Attempt> {
+        let app = self.app()?;
+        let Some(job) = self.jobs.get_mut(&key) else {
+            // Over, or never ours: in both cases the coordinator may forget it.
+            self.say_already_delivered(key.in_app(app));
+            return None;
+        };
+        match job.place {
+            Some(current) if current.attempt > placement.attempt => return None,
+            // The same plan again (the coordinator repeats what it holds after a reconnect).
+            Some(current) if current == placement => return None,
+            Some(current) => {
+                job.place = Some(placement);
+                if current.attempt < placement.attempt {
+                    self.counts.replanned_jobs += 1;
+                }
+                self.leaves_node(current);
+            }
+            None => {
+                job.place = Some(placement);
+                if let Some(batch) = self.batches.get_mut(&job.batch) {
+                    batch.waiting_jobs -= 1;
+                }
+                self.counts.waiting_jobs -= 1;
+                self.counts.outstanding_jobs += 1;
+            }
+        }
+        Some(placement.attempt).inspect(|&attempt| self.enters_node(placement.life, attempt, key))
+    }
+
+    fn fail(&mut self, key: JobKey, job: JobId, failure: JobFailure) {
+        self.close(key);
+        self.counts.failed_jobs += 1;
+        self.push(Effect::Fail { job, failure });
+        self.push(Effect::ForgetProgram(job));
+    }
+
+    /// An open job is over: exactly one `Deliver` or `Fail` goes with each call.
+    fn close(&mut self, key: JobKey) {
+        let job = self.jobs.remove(&key).expect("only open jobs are closed");
+        assert!(self.over.insert(key), "I2: job {key} ended twice");
+        if let Some(batch) = self.batches.get_mut(&job.batch) {
+            batch.open_jobs -= 1;
+            if batch.requested {
+                self.requested_jobs -= 1;
+            }
+            if job.place.is_none() {
+                batch.waiting_jobs -= 1;
+            }
+            if batch.open_jobs == 0 {
+                self.batches.remove(&job.batch);
+            }
+        }
+        match job.place {
+            Some(place) => {
+                self.counts.outstanding_jobs -= 1;
+                self.leaves_node(place);
+            }
+            None => self.counts.waiting_jobs -= 1,
+        }
+    }
+}

@@ -1,0 +1,209 @@
+//! The ledger's talk with the coordinator: registration, resumption, heartbeats, plan requests. It never touches a
+//! node's link.
+
+use std::{collections::BTreeSet, time::Duration};
+
+use super::{Effect, Ledger};
+use crate::{
+    id::{AppId, AppIncarnation, BatchId, JobId, JobKey},
+    message::{AppHello, AppToCoordinator, CoordinatorToApp, Liveness, PlanJob, PlanRequest},
+    program::Content,
+    time::Instant,
+};
+
+/// Most open jobs asked for at once, in jobs; further batches wait here, in the application's own memory. A quarter of
+/// what the coordinator holds for one application before it refuses it.
+const MAX_REQUESTED_JOBS: u64 = 262_144;
+
+/// Most contents named in one plan request: they are a hint for placement, not a promise.
+const MAX_REQUEST_CONTENTS: usize = 64;
+
+/// Most jobs in one `AlreadyDelivered`.
+const MAX_ALREADY_DELIVERED: usize = 4_096;
+
+/// How the ledger stands with the coordinator.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Session {
+    /// No connection.
+    Offline,
+    /// Hello said, no welcome yet.
+    Greeting,
+    /// Welcome.
+    Registered {
+        /// When to say that we are alive.
+        next_heartbeat: Instant,
+    },
+    /// The coordinator wants nothing of us.
+    Refused,
+    /// Goodbye said.
+    Finished,
+}
+
+impl Session {
+    /// The timer of this state.
+    pub(super) const fn next_heartbeat(self) -> Option<Instant> {
+        match self {
+            Self::Registered { next_heartbeat } => Some(next_heartbeat),
+            Self::Offline | Self::Greeting | Self::Refused | Self::Finished => None,
+        }
+    }
+}
+
+/// Who the coordinator says we are.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct Identity {
+    pub(super) app: AppId,
+    pub(super) incarnation: AppIncarnation,
+}
+
+impl Ledger {
+    pub(super) fn coordinator_connected(&mut self) {
+        match self.session {
+            Session::Offline | Session::Greeting | Session::Registered { .. } => {}
+            Session::Refused | Session::Finished => return,
+        }
+        self.session = Session::Greeting;
+        let resume = self.identity.map(|identity| (identity.app, identity.incarnation));
+        let hello = AppHello { resume, ..self.hello.clone() };
+        self.tell_coordinator(AppToCoordinator::Hello(hello));
+    }
+
+    pub(super) fn coordinator_lost(&mut self) {
+        match self.session {
+            Session::Offline | Session::Greeting | Session::Registered { .. } => {
+                self.session = Session::Offline
+            }
+            Session::Refused | Session::Finished => {}
+        }
+        // Results keep coming over the data links; what the coordinator missed is said again after the welcome.
+        self.already_delivered.clear();
+    }
+
+    pub(super) fn from_coordinator(&mut self, now: Instant, message: CoordinatorToApp) {
+        match message {
+            CoordinatorToApp::Welcome { app, incarnation, epoch: _, liveness } => {
+                self.welcomed(now, Identity { app, incarnation }, liveness);
+            }
+            CoordinatorToApp::Refused { reason } => {
+                self.session = Session::Refused;
+                self.push(Effect::Refused { reason });
+            }
+            CoordinatorToApp::Plan(plan) => self.planned(now, plan),
+            CoordinatorToApp::Waiting { batch, reason } => {
+                if let Some(waiting) = self.batches.get(&batch) {
+                    let task = waiting.task;
+                    self.push(Effect::Waiting { batch, task, reason });
+                }
+            }
+            CoordinatorToApp::JobFailed { job, failure } => self.given_up(job, failure),
+            CoordinatorToApp::HeartbeatAck { sequence: _ } => {}
+        }
+    }
+
+    pub(super) fn session_timeout(&mut self, now: Instant) {
+        let Session::Registered { next_heartbeat } = self.session else { return };
+        if next_heartbeat > now {
+            return;
+        }
+        self.session = Session::Registered { next_heartbeat: self.heartbeat_after(now) };
+        self.heartbeat_sequence += 1;
+        let sequence = self.heartbeat_sequence;
+        self.tell_coordinator(AppToCoordinator::Heartbeat { sequence });
+    }
+
+    /// Puts what is to be said to the coordinator into messages.
+    pub(super) fn flush_session(&mut self) {
+        if !matches!(self.session, Session::Registered { .. }) {
+            return;
+        }
+        while !self.already_delivered.is_empty() {
+            let rest =
+                self.already_delivered.split_off(self.already_delivered.len().min(MAX_ALREADY_DELIVERED));
+            let jobs = std::mem::replace(&mut self.already_delivered, rest);
+            self.tell_coordinator(AppToCoordinator::AlreadyDelivered(jobs));
+        }
+        while self.requested_jobs < MAX_REQUESTED_JOBS {
+            let Some(batch) = self.to_request.pop_front() else { break };
+            self.request(batch);
+        }
+    }
+
+    pub(super) fn finished(&mut self) {
+        // Acknowledgements first: a worker that gets them keeps no result of ours.
+        self.flush_session();
+        self.flush_nodes();
+        if matches!(self.session, Session::Registered { .. } | Session::Greeting) {
+            self.tell_coordinator(AppToCoordinator::Goodbye);
+        }
+        self.session = Session::Finished;
+        self.close_all_nodes();
+        self.drop_open_jobs();
+        self.to_request.clear();
+        self.already_delivered.clear();
+        self.requested_jobs = 0;
+    }
+
+    fn welcomed(&mut self, now: Instant, identity: Identity, liveness: Liveness) {
+        if self.session != Session::Greeting {
+            return;
+        }
+        self.liveness = liveness;
+        self.session = Session::Registered { next_heartbeat: self.heartbeat_after(now) };
+        let before = self.identity.replace(identity);
+        // Another incarnation means that the coordinator knows none of our jobs: ask for all of them again. Their
+        // attempts stay valid until larger ones come, so a result on its way is not lost.
+        let forgotten = before != Some(identity);
+        if before.is_some_and(|before| before.app != identity.app) {
+            // Attempts of another application id can never be answered: nodes hold them under the old id.
+            self.unplace_all();
+        }
+        self.to_request.clear();
+        for (&id, batch) in &mut self.batches {
+            batch.ask_all |= forgotten;
+            if !batch.ask_all && batch.waiting_jobs == 0 {
+                continue;
+            }
+            self.to_request.push_back(id);
+            if std::mem::take(&mut batch.requested) {
+                self.requested_jobs -= u64::from(batch.open_jobs);
+            }
+        }
+        self.say_unreachable_again();
+    }
+
+    fn heartbeat_after(&self, now: Instant) -> Instant {
+        now.after(Duration::from_millis(self.liveness.heartbeat_ms.max(1)))
+    }
+
+    fn request(&mut self, id: BatchId) {
+        let Some(batch) = self.batches.get_mut(&id) else { return };
+        if !batch.requested {
+            batch.requested = true;
+            self.requested_jobs += u64::from(batch.open_jobs);
+        }
+        let ask_all = std::mem::take(&mut batch.ask_all);
+        let mut jobs = Vec::with_capacity(batch.indices.len());
+        let mut contents: BTreeSet<Content> = BTreeSet::new();
+        for &index in &batch.indices {
+            let Some(job) = self.jobs.get(&JobKey { task: batch.task, index }) else { continue };
+            if job.place.is_some() && !ask_all {
+                continue;
+            }
+            jobs.push(PlanJob { index, cost: job.cost });
+            if contents.len() < MAX_REQUEST_CONTENTS {
+                contents.extend(&job.contents);
+            }
+        }
+        if jobs.is_empty() {
+            return;
+        }
+        let contents = contents.into_iter().take(MAX_REQUEST_CONTENTS).collect();
+        let (task, needs) = (batch.task, batch.needs);
+        self.tell_coordinator(AppToCoordinator::Plan(PlanRequest { batch: id, task, jobs, needs, contents }));
+    }
+
+    /// Tells the coordinator that a job it planned is over.
+    pub(super) fn say_already_delivered(&mut self, job: JobId) {
+        self.already_delivered.push(job);
+    }
+}

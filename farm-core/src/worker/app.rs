@@ -1,0 +1,200 @@
+//! Applications as a node knows them: who they are, their one current link, when they are gone.
+
+use std::time::Duration;
+
+use super::{Effect, WorkerMachine};
+use crate::{
+    id::{AppId, AppIncarnation, JobAttempt, LinkId},
+    message::{AppToNode, NodeToApp, PROTOCOL_VERSION},
+    time::Instant,
+};
+
+/// Weight of an application that the coordinator has not announced yet.
+const UNANNOUNCED_WEIGHT: f64 = 1.0;
+
+/// How long an application's jobs are kept while a registered node waits for its announcement, in milliseconds. The
+/// same as the coordinator's lease on a vanished application.
+const UNANNOUNCED_MS: u64 = 30_000;
+
+/// Most applications on one node; a further one is refused.
+const MAX_APPS: usize = 16_384;
+
+/// An application with a link, jobs, or an announcement.
+#[derive(Debug, Default)]
+pub(super) struct App {
+    /// The coordinator vouches for it.
+    pub(super) announced: bool,
+    /// When it is dropped, unless it is announced before.
+    pub(super) drop_at: Option<Instant>,
+    incarnation: Option<AppIncarnation>,
+    /// Where its results go.
+    pub(super) link: Option<LinkId>,
+    /// Its jobs in [`WorkerMachine::jobs`].
+    pub(super) held_jobs: usize,
+    /// Its jobs that could be staged, are staged or run: what makes it backlogged.
+    pub(super) active_jobs: usize,
+}
+
+impl WorkerMachine {
+    pub(super) fn from_app(&mut self, now: Instant, link: LinkId, message: AppToNode) {
+        let app = match message {
+            AppToNode::Hello { protocol, app, incarnation } => {
+                return self.app_hello(now, link, protocol, app, incarnation);
+            }
+            AppToNode::Jobs(_) | AppToNode::Acks(_) | AppToNode::Cancel(_) => match self.links.get(&link) {
+                Some(&app) => app,
+                None => return self.refuse_app(link, "say hello first".to_owned()),
+            },
+        };
+        let own = |job: &JobAttempt| job.job.app == app;
+        match message {
+            AppToNode::Hello { .. } => {}
+            AppToNode::Jobs(tickets) => {
+                if tickets.iter().all(|ticket| own(&ticket.job)) {
+                    tickets.into_iter().for_each(|ticket| self.take_in(now, link, ticket));
+                } else {
+                    self.app_link_closed(now, link);
+                    self.refuse_app(link, format!("jobs of another application than {app}"));
+                }
+            }
+            AppToNode::Acks(acks) => {
+                for ack in acks.into_iter().filter(|ack| own(&ack.job)) {
+                    self.acknowledged(now, ack);
+                }
+            }
+            AppToNode::Cancel(jobs) => jobs.into_iter().filter(own).for_each(|job| self.cancel(job)),
+        }
+    }
+
+    pub(super) fn app_link_closed(&mut self, now: Instant, link: LinkId) {
+        let Some(id) = self.links.remove(&link) else { return };
+        if let Some(app) = self.apps.get_mut(&id)
+            && app.link == Some(link)
+        {
+            app.link = None;
+        }
+        self.forget_if_idle(id);
+        self.link_fetches_nothing(now, link);
+    }
+
+    pub(super) fn app_joined(&mut self, id: AppId, weight: f64) {
+        let app = self.apps.entry(id).or_default();
+        app.announced = true;
+        app.drop_at = None;
+        self.share.join(id, weight);
+    }
+
+    /// Everything of the application is dropped, whatever state it is in.
+    pub(super) fn app_left(&mut self, id: AppId) {
+        self.drop_jobs_of(id);
+        self.tombstones.forget_app(id);
+        let links: Vec<LinkId> =
+            self.links.iter().filter(|(_, app)| **app == id).map(|(&link, _)| link).collect();
+        for link in links {
+            self.links.remove(&link);
+            self.push(Effect::CloseApp { link });
+        }
+        if self.apps.remove(&id).is_some() {
+            self.share.leave(id);
+        }
+    }
+
+    /// Registered (again): every living application is announced now, or was gone before.
+    pub(super) fn await_announcements(&mut self, now: Instant) {
+        let drop_at = now.after(Duration::from_millis(UNANNOUNCED_MS));
+        for app in self.apps.values_mut() {
+            app.announced = false;
+            app.drop_at = Some(drop_at);
+        }
+    }
+
+    pub(super) fn app_timeout(&mut self, now: Instant) {
+        let gone: Vec<AppId> = self
+            .apps
+            .iter()
+            .filter(|(_, app)| app.drop_at.is_some_and(|drop_at| drop_at <= now))
+            .map(|(&id, _)| id)
+            .collect();
+        gone.into_iter().for_each(|id| self.app_left(id));
+    }
+
+    fn app_hello(
+        &mut self,
+        now: Instant,
+        link: LinkId,
+        protocol: u32,
+        id: AppId,
+        incarnation: AppIncarnation,
+    ) {
+        if let Err(reason) = self.admit_app(link, protocol, id, incarnation) {
+            self.app_link_closed(now, link);
+            self.refuse_app(link, reason);
+            return;
+        }
+        let Some(node) = self.node else { return };
+        let registered = self.session.is_registered();
+        let known = self.apps.contains_key(&id);
+        let app = self.apps.entry(id).or_default();
+        app.incarnation = Some(incarnation);
+        if !known {
+            app.drop_at = registered.then(|| now.after(Duration::from_millis(UNANNOUNCED_MS)));
+            self.share.join(id, UNANNOUNCED_WEIGHT);
+        }
+        // The newest link is the one that stands: an older one is half-open, or about to be.
+        if let Some(old) = app.link.replace(link)
+            && old != link
+        {
+            self.links.remove(&old);
+            self.push(Effect::CloseApp { link: old });
+            self.link_fetches_nothing(now, old);
+        }
+        self.links.insert(link, id);
+        let welcome = NodeToApp::Welcome { node, session: self.config.session };
+        self.push(Effect::ToApp { link, message: welcome });
+        self.resend_results(id, link);
+        self.fetch_wanted();
+    }
+
+    fn admit_app(
+        &self,
+        link: LinkId,
+        protocol: u32,
+        id: AppId,
+        incarnation: AppIncarnation,
+    ) -> Result<(), String> {
+        if protocol != PROTOCOL_VERSION {
+            return Err(format!(
+                "protocol version {protocol} is not spoken here, version {PROTOCOL_VERSION} is"
+            ));
+        }
+        if self.node.is_none() {
+            return Err("this node is not registered yet".to_owned());
+        }
+        if self.links.get(&link).is_some_and(|app| *app != id) {
+            return Err("a link belongs to one application".to_owned());
+        }
+        match self.apps.get(&id) {
+            Some(app) if app.incarnation.is_some_and(|known| known > incarnation) => {
+                Err(format!("{id} has a later life than {incarnation}"))
+            }
+            Some(_) => Ok(()),
+            None if self.apps.len() >= MAX_APPS => Err(format!("{MAX_APPS} applications are here already")),
+            None => Ok(()),
+        }
+    }
+
+    fn refuse_app(&mut self, link: LinkId, reason: String) {
+        self.push(Effect::ToApp { link, message: NodeToApp::Refused { reason } });
+        self.push(Effect::CloseApp { link });
+    }
+
+    /// Without announcement, link and jobs nothing is left of an application.
+    pub(super) fn forget_if_idle(&mut self, id: AppId) {
+        let idle =
+            self.apps.get(&id).is_some_and(|app| !app.announced && app.link.is_none() && app.held_jobs == 0);
+        if idle {
+            self.apps.remove(&id);
+            self.share.leave(id);
+        }
+    }
+}

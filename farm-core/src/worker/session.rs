@@ -1,0 +1,129 @@
+//! The worker's talk with the coordinator: registration, heartbeats, orders. Losing it stops nothing: running, queueing
+//! and delivering go on.
+
+use std::time::Duration;
+
+use super::{Effect, WorkerMachine, drain::Drain};
+use crate::{
+    id::JobAttempt,
+    message::{CoordinatorToNode, DeviceLoad, Liveness, NodeHello, NodeToCoordinator, PROTOCOL_VERSION},
+    time::Instant,
+};
+
+/// How the worker stands with the coordinator.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Session {
+    /// No connection.
+    Offline,
+    /// Hello said, no welcome yet.
+    Greeting,
+    /// Welcome.
+    Registered {
+        /// Timings to keep.
+        liveness: Liveness,
+        /// When to say that we are alive.
+        next_heartbeat: Instant,
+    },
+}
+
+impl Session {
+    /// The timer of this state.
+    pub(super) const fn next_heartbeat(self) -> Option<Instant> {
+        match self {
+            Self::Registered { next_heartbeat, .. } => Some(next_heartbeat),
+            Self::Offline | Self::Greeting => None,
+        }
+    }
+
+    pub(super) const fn is_registered(self) -> bool {
+        matches!(self, Self::Registered { .. })
+    }
+}
+
+impl WorkerMachine {
+    pub(super) fn coordinator_connected(&mut self) {
+        self.session = Session::Greeting;
+        let inventory =
+            self.jobs.iter().map(|(&job, held)| JobAttempt { job, attempt: held.attempt }).collect();
+        self.tell_coordinator(NodeToCoordinator::Hello(NodeHello {
+            protocol: PROTOCOL_VERSION,
+            name: self.config.name.clone(),
+            session: self.config.session,
+            devices: self.config.devices.clone(),
+            contact: self.config.contact.clone(),
+            inventory,
+        }));
+    }
+
+    pub(super) fn coordinator_lost(&mut self) {
+        self.session = Session::Offline;
+        self.reports.unsend();
+        // Only a registered worker can be told of applications.
+        for app in self.apps.values_mut() {
+            app.drop_at = None;
+        }
+    }
+
+    pub(super) fn from_coordinator(&mut self, now: Instant, message: CoordinatorToNode) {
+        match message {
+            CoordinatorToNode::Welcome { node, epoch: _, liveness } => {
+                if self.session != Session::Greeting {
+                    return;
+                }
+                self.node = Some(node);
+                self.session =
+                    Session::Registered { liveness, next_heartbeat: next_heartbeat(now, &liveness) };
+                self.reports.unsend();
+                self.await_announcements(now);
+                self.tell_lost_devices();
+            }
+            CoordinatorToNode::Refused { reason } => self.refused(&reason),
+            CoordinatorToNode::AppJoined { app, weight } => self.app_joined(app, weight),
+            CoordinatorToNode::AppLeft { app } => self.app_left(app),
+            CoordinatorToNode::Cancel { jobs } => jobs.into_iter().for_each(|job| self.cancel(job)),
+            CoordinatorToNode::Drain => self.start_drain(now),
+            CoordinatorToNode::HeartbeatAck { sequence } => self.reports.confirm(sequence),
+        }
+    }
+
+    pub(super) fn session_timeout(&mut self, now: Instant) {
+        let Session::Registered { liveness, next_heartbeat: due } = self.session else { return };
+        if due > now {
+            return;
+        }
+        self.session = Session::Registered { liveness, next_heartbeat: next_heartbeat(now, &liveness) };
+        self.heartbeat_sequence += 1;
+        let devices = self.loads();
+        self.tell_coordinator(NodeToCoordinator::Heartbeat {
+            sequence: self.heartbeat_sequence,
+            devices,
+            spool_bytes: self.spool_bytes,
+        });
+        self.reports.heartbeat_said(self.heartbeat_sequence);
+    }
+
+    fn loads(&self) -> Vec<DeviceLoad> {
+        self.devices.iter().map(super::device::Device::load).collect()
+    }
+
+    /// The coordinator may have missed it, or be another one.
+    fn tell_lost_devices(&mut self) {
+        let lost: Vec<_> = self.lost_devices().collect();
+        for device in lost {
+            let reason = "lost earlier in this session".to_owned();
+            self.tell_coordinator(NodeToCoordinator::DeviceLost { device, reason });
+        }
+    }
+
+    /// A newer process of the same name, or another protocol: nothing that this process does counts any more.
+    fn refused(&mut self, reason: &str) {
+        tracing::error!(reason, "coordinator refused this node");
+        self.drop_everything();
+        self.drain = Drain::Gone;
+        self.push(Effect::Exit);
+    }
+}
+
+fn next_heartbeat(now: Instant, liveness: &Liveness) -> Instant {
+    now.after(Duration::from_millis(liveness.heartbeat_ms.max(1)))
+}
