@@ -1,33 +1,110 @@
-//! Devices that compute: one thread, one wgpu device each.
+//! Devices that compute: a thread and a wgpu device each.
+//!
+//! [`RealDevice`] is the handle; [`thread`] runs the orders: [`prepare`] turns one into what can be submitted, [`run`]
+//! submits it in bounded pieces.
 
 mod adapter;
+mod clock;
+mod memory;
+mod module;
+mod pace;
+mod pipeline;
+mod prepare;
+mod run;
+mod scope;
+mod score;
+mod thread;
+mod trusted;
+
+use std::{
+    sync::{
+        Arc,
+        atomic::{AtomicBool, AtomicUsize, Ordering},
+        mpsc,
+    },
+    thread as std_thread,
+};
+
+use farm_core::{device::DeviceInfo, id::JobAttempt};
 
 pub(crate) use self::adapter::all;
 pub use self::adapter::{Adapter, enumerate};
+use self::{
+    adapter::Gpu,
+    thread::{DeviceThread, Message},
+};
 use crate::{
     error::{Busy, OpenError},
     executor::{EventSink, ExecutorConfig, Order},
     spec::DeviceSpec,
 };
-use farm_core::{device::DeviceInfo, id::JobAttempt};
 
+/// Jobs held at once: one runs, one is staged.
+const DEPTH: usize = 2;
+/// Stack of a device's thread: naga recurses over the text of a module.
+const STACK_BYTES: usize = 16 << 20;
+
+/// The handle of a device's thread.
 #[derive(Debug)]
-pub(crate) struct RealDevice {}
+pub(crate) struct RealDevice {
+    inbox: mpsc::Sender<Message>,
+    shared: Arc<Shared>,
+}
+
+/// What the handle and the thread both see.
+#[derive(Debug, Default)]
+struct Shared {
+    /// Jobs taken and not yet finished.
+    held: AtomicUsize,
+    lost: AtomicBool,
+}
 
 impl RealDevice {
     pub(crate) fn start(
         spec: DeviceSpec,
-        _config: ExecutorConfig,
-        _on_event: EventSink,
+        config: ExecutorConfig,
+        on_event: EventSink,
     ) -> Result<(Self, DeviceInfo), OpenError> {
-        let gpu = adapter::Gpu::open(spec)?;
-        let reason = "the executor of real devices is still to come".to_owned();
-        Err(OpenError::Device { spec, adapter: gpu.name, reason })
+        let gpu = Gpu::open(spec)?;
+        let score = score::measure(&gpu).map_err(|reason| OpenError::Device {
+            spec,
+            adapter: gpu.name.clone(),
+            reason,
+        })?;
+        let info = DeviceInfo {
+            name: gpu.name.clone(),
+            kind: gpu.kind,
+            score,
+            features: gpu.farm_features(),
+            limits: gpu.farm_limits(),
+        };
+        tracing::info!(%spec, name = info.name, score, "device open");
+        let shared = Arc::<Shared>::default();
+        // Bounded by DEPTH orders and the aborts of these.
+        let (sender, inbox) = mpsc::channel();
+        let thread = DeviceThread::new(spec, gpu, config, inbox, Arc::clone(&shared), on_event);
+        std_thread::Builder::new()
+            .name(format!("device {spec}"))
+            .stack_size(STACK_BYTES)
+            .spawn(move || thread.run())
+            .map_err(|source| OpenError::Thread { spec, source })?;
+        Ok((Self { inbox: sender, shared }, info))
     }
 
     pub(crate) fn submit(&self, order: Order) -> Result<(), Busy> {
-        Err(Busy::Lost { job: order.job })
+        let job = order.job;
+        if self.shared.lost.load(Ordering::Acquire) {
+            return Err(Busy::Lost { job });
+        }
+        let take = |held| (held < DEPTH).then_some(held + 1);
+        if self.shared.held.fetch_update(Ordering::AcqRel, Ordering::Acquire, take).is_err() {
+            return Err(Busy::Full { job });
+        }
+        self.inbox.send(Message::Order(order)).map_err(|_| Busy::Lost { job })
     }
 
-    pub(crate) fn abort(&self, _job: JobAttempt) {}
+    pub(crate) fn abort(&self, job: JobAttempt) {
+        // A thread that has ended holds no job.
+        let _ = self.inbox.send(Message::Abort(job));
+    }
 }

@@ -1,0 +1,281 @@
+//! A device's thread: takes orders, keeps one running and one staged, replaces a device that hangs or is lost.
+//!
+//! A fault costs the running attempt only: the staged order is prepared again on the new device.
+
+use std::{
+    any::Any,
+    mem,
+    panic::{AssertUnwindSafe, catch_unwind},
+    sync::{
+        Arc,
+        atomic::{AtomicUsize, Ordering},
+        mpsc::{Receiver, RecvError, TryRecvError},
+    },
+    thread,
+    time::{Duration, Instant},
+};
+
+use bytes::Bytes;
+use farm_core::{id::JobAttempt, message::JobFailure};
+
+use super::{
+    Shared,
+    adapter::Gpu,
+    clock::TimestampPool,
+    prepare::{Caches, Prepared, prepare},
+    run::{Hung, Run},
+};
+use crate::{
+    executor::{EventSink, ExecutorConfig, ExecutorEvent, Order},
+    spec::DeviceSpec,
+};
+
+/// One wait for the device; new orders and aborts are seen after it.
+const WAIT_SLICE: Duration = Duration::from_millis(1);
+/// Hung devices that may be left behind at once, each with its memory; one more and the device counts as lost.
+const MAX_ABANDONED: usize = 3;
+
+/// What the handle sends.
+#[derive(Debug)]
+pub(super) enum Message {
+    Order(Order),
+    Abort(JobAttempt),
+}
+
+/// The thread's state.
+pub(super) struct DeviceThread {
+    spec: DeviceSpec,
+    config: ExecutorConfig,
+    inbox: Receiver<Message>,
+    shared: Arc<Shared>,
+    on_event: EventSink,
+    state: State,
+    /// Hung devices whose work has not ended yet.
+    abandoned: Arc<AtomicUsize>,
+}
+
+/// Everything that lives on one wgpu device, and the jobs on it.
+struct State {
+    gpu: Gpu,
+    caches: Caches,
+    timestamps: TimestampPool,
+    running: Option<Run>,
+    /// The order stays at hand: its preparation dies with the device.
+    staged: Option<(Order, Prepared)>,
+    /// Orders not yet prepared; at most as many as the device holds.
+    waiting: Vec<Order>,
+}
+
+impl State {
+    fn new(gpu: Gpu, config: &ExecutorConfig) -> Self {
+        let caches = Caches::new(&gpu, config);
+        let timestamps = TimestampPool::default();
+        Self { gpu, caches, timestamps, running: None, staged: None, waiting: Vec::new() }
+    }
+}
+
+/// Why a round of work ended early.
+enum Fault {
+    /// The device does not answer.
+    Hung(Hung),
+    /// The executor's handle is gone.
+    Closed,
+}
+
+impl DeviceThread {
+    pub(super) fn new(
+        spec: DeviceSpec,
+        gpu: Gpu,
+        config: ExecutorConfig,
+        inbox: Receiver<Message>,
+        shared: Arc<Shared>,
+        on_event: EventSink,
+    ) -> Self {
+        let state = State::new(gpu, &config);
+        Self { spec, config, inbox, shared, on_event, state, abandoned: Arc::default() }
+    }
+
+    /// Works until the handle is dropped.
+    pub(super) fn run(mut self) {
+        loop {
+            // wgpu panics where a driver breaks its contract, and naga's depths are its own: neither may take the
+            // thread, or the jobs on it would never end.
+            let fault = catch_unwind(AssertUnwindSafe(|| self.work()))
+                .unwrap_or_else(|panic| Fault::Hung(Hung(panic_text(panic.as_ref()))));
+            let reason = match fault {
+                Fault::Closed => return,
+                Fault::Hung(reason) => reason,
+            };
+            if let Err(lost) = self.replace_device(&reason) {
+                return self.lose(lost);
+            }
+        }
+    }
+
+    /// Rounds of: take messages, prepare, submit, wait.
+    fn work(&mut self) -> Fault {
+        loop {
+            if let Err(RecvError) = self.take_messages() {
+                return Fault::Closed;
+            }
+            self.submit();
+            self.prepare_next();
+            if let Some(running) = &mut self.state.running
+                && let Err(hung) = running.wait(&self.state.gpu, &mut self.state.timestamps, WAIT_SLICE)
+            {
+                return Fault::Hung(hung);
+            }
+            self.hand_over();
+        }
+    }
+
+    /// Takes what has come; sleeps while there is nothing else to do.
+    fn take_messages(&mut self) -> Result<(), RecvError> {
+        let state = &self.state;
+        if state.running.is_none() && state.staged.is_none() && state.waiting.is_empty() {
+            let message = self.inbox.recv()?;
+            self.take(message);
+        }
+        loop {
+            match self.inbox.try_recv() {
+                Ok(message) => self.take(message),
+                Err(TryRecvError::Empty) => return Ok(()),
+                Err(TryRecvError::Disconnected) => return Err(RecvError),
+            }
+        }
+    }
+
+    fn take(&mut self, message: Message) {
+        match message {
+            Message::Order(order) => self.state.waiting.push(order),
+            Message::Abort(job) => self.abort(job),
+        }
+    }
+
+    fn abort(&mut self, job: JobAttempt) {
+        let state = &mut self.state;
+        if let Some(position) = state.waiting.iter().position(|order| order.job == job) {
+            state.waiting.remove(position);
+            self.finished(job, 0, Err(JobFailure::Cancelled));
+        } else if let Some((_, prepared)) = state.staged.take_if(|(order, _)| order.job == job) {
+            prepared.held.release(&mut state.caches);
+            self.finished(job, 0, Err(JobFailure::Cancelled));
+        } else if let Some(running) = state.running.as_mut().filter(|running| running.job == job) {
+            running.end_with(JobFailure::Cancelled, Instant::now());
+        }
+    }
+
+    fn submit(&mut self) {
+        let State { gpu, timestamps, running, .. } = &mut self.state;
+        if let Some(running) = running {
+            running.fill(gpu, timestamps, self.config.submit_target);
+        }
+    }
+
+    /// Prepares a waiting order, if there is room: the device is free, or one only runs.
+    fn prepare_next(&mut self) {
+        while self.state.staged.is_none() && !self.state.waiting.is_empty() {
+            let order = self.state.waiting.remove(0);
+            let job = order.job;
+            // A panic in here is the order's: it must not come back.
+            let prepared =
+                catch_unwind(AssertUnwindSafe(|| prepare(&self.state.gpu, &mut self.state.caches, &order)))
+                    .unwrap_or_else(|panic| Err(JobFailure::InvalidProgram(panic_text(panic.as_ref()))));
+            match prepared {
+                Ok(prepared) => self.state.staged = Some((order, prepared)),
+                Err(failure) => self.finished(job, 0, Err(failure)),
+            }
+            self.hand_over();
+        }
+    }
+
+    /// Ends a job that is over and starts the staged one: its first submits go out before the old result is copied.
+    fn hand_over(&mut self) {
+        let over = self.state.running.take_if(|running| running.is_over());
+        if self.state.running.is_some() {
+            return;
+        }
+        let next = self.state.staged.take().map(|(_, prepared)| {
+            let mut run = Run::new(prepared, Instant::now());
+            run.fill(&self.state.gpu, &mut self.state.timestamps, self.config.submit_target);
+            run
+        });
+        if let Some(over) = over {
+            let job = over.job;
+            let (device_time_ns, outcome) = over.finish(&mut self.state.caches);
+            self.finished(job, device_time_ns, outcome);
+        }
+        if let Some(next) = next {
+            (self.on_event)(ExecutorEvent::Started { job: next.job });
+            self.state.running = Some(next);
+        }
+    }
+
+    fn finished(&self, job: JobAttempt, device_time_ns: u64, outcome: Result<Vec<Bytes>, JobFailure>) {
+        // First, so that the callback may submit the next one.
+        self.shared.held.fetch_sub(1, Ordering::AcqRel);
+        (self.on_event)(ExecutorEvent::Finished { job, device_time_ns, outcome });
+    }
+
+    /// Ends the running attempt, leaves the device behind and opens a new one.
+    fn replace_device(&mut self, reason: &Hung) -> Result<(), String> {
+        tracing::warn!(spec = %self.spec, reason = reason.0, "replacing the device");
+        self.fail_running(reason);
+        let opened = Gpu::open(self.spec);
+        let gpu = opened.map_err(|error| format!("{}; it does not open again: {error}", reason.0))?;
+        let mut old = mem::replace(&mut self.state, State::new(gpu, &self.config));
+        let staged = old.staged.take().map(|(order, _)| order);
+        self.state.waiting = staged.into_iter().chain(mem::take(&mut old.waiting)).collect();
+        self.leave_behind(old).map_err(|error| format!("{}; {error}", reason.0))
+    }
+
+    fn fail_running(&mut self, reason: &Hung) {
+        if let Some(running) = self.state.running.take() {
+            let job = running.job;
+            let (device_time_ns, failure) = running.abandon(reason);
+            self.finished(job, device_time_ns, Err(failure));
+        }
+    }
+
+    /// Drops a hung device on a thread of its own: the drop waits until its work ends.
+    fn leave_behind(&self, old: State) -> Result<(), String> {
+        if self.abandoned.fetch_add(1, Ordering::AcqRel) >= MAX_ABANDONED {
+            // Dropping would hang; its memory is the price of a clear error.
+            mem::forget(old);
+            return Err(format!("{MAX_ABANDONED} hung devices have not ended yet"));
+        }
+        let abandoned = Arc::clone(&self.abandoned);
+        let dispose = move || {
+            let _ = catch_unwind(AssertUnwindSafe(|| drop(old)));
+            abandoned.fetch_sub(1, Ordering::AcqRel);
+        };
+        thread::Builder::new()
+            .name("device disposal".to_owned())
+            .spawn(dispose)
+            .map(drop)
+            .map_err(|error| format!("no thread to dispose of it: {error}"))
+    }
+
+    /// The device is gone for good: every job on it and every one that still comes ends so.
+    fn lose(mut self, reason: String) {
+        self.shared.lost.store(true, Ordering::Release);
+        let failure = || Err(JobFailure::DeviceLost(reason.clone()));
+        let staged = self.state.staged.take().map(|(order, _)| order);
+        for order in staged.into_iter().chain(mem::take(&mut self.state.waiting)) {
+            self.finished(order.job, 0, failure());
+        }
+        (self.on_event)(ExecutorEvent::Lost { reason: reason.clone() });
+        // An order may have been sent while the flag was being set.
+        while let Ok(message) = self.inbox.recv() {
+            if let Message::Order(order) = message {
+                self.finished(order.job, 0, failure());
+            }
+        }
+    }
+}
+
+fn panic_text(panic: &(dyn Any + Send)) -> String {
+    let text = panic.downcast_ref::<String>().map(String::as_str);
+    let text = text.or_else(|| panic.downcast_ref::<&str>().copied()).unwrap_or("no message");
+    format!("panic in the device's thread: {text}")
+}

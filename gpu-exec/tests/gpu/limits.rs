@@ -1,0 +1,151 @@
+//! Depth, aborts and the limit of a job.
+
+use std::time::Duration;
+
+use bytes::Bytes;
+use farm_core::{
+    id::ContentHash,
+    message::{CostNs, JobFailure},
+    program::{JobProgram, Slicing},
+};
+use gpu_exec::{Busy, ExecutorEvent, Order};
+
+use crate::device::{TestDevice, content};
+
+/// `rounds` dependent multiplications in each of 64 invocations; bounded, and no compiler can shorten it.
+const SPIN: &str = "
+@group(0) @binding(0) var<storage, read_write> out: array<u32>;
+@group(1) @binding(0) var<uniform> rounds: u32;
+@group(1) @binding(1) var<uniform> first_z: u32;
+@compute @workgroup_size(64) fn spin(@builtin(global_invocation_id) id: vec3u) {
+    var x = id.x + id.z + first_z;
+    for (var i = 0u; i < rounds; i++) { x = (x ^ (x >> 13u)) * 1664525u + i; }
+    atomic_free(id.x, x);
+}
+fn atomic_free(index: u32, x: u32) { if x == 12345u { out[index] = x; } }
+@compute @workgroup_size(64) fn spin_once(@builtin(global_invocation_id) id: vec3u) {
+    var x = id.x;
+    for (var i = 0u; i < rounds; i++) { x = (x ^ (x >> 13u)) * 1664525u + i; }
+    atomic_free(id.x, x);
+}";
+
+fn spin(rounds: u32, layers: Option<u32>) -> (JobProgram, Vec<(ContentHash, Bytes)>) {
+    let (module, module_bytes) = content(SPIN.as_bytes());
+    let mut program = JobProgram::default();
+    let kernel = program.function(module, if layers.is_some() { "spin" } else { "spin_once" });
+    let out = program.malloc(256).unwrap();
+    program.param_in_out(kernel, 0, out).unwrap();
+    program.memcpy_htod(kernel, "rounds", &rounds.to_le_bytes()).unwrap();
+    match layers {
+        Some(layers) => {
+            let slicing = Slicing { global: "first_z".to_owned(), max_groups_z: 16 };
+            program.launch_sliced(kernel, [1, 1, layers], slicing, CostNs(0)).unwrap();
+        }
+        None => program.launch(kernel, [1, 1, 1]).unwrap(),
+    }
+    program.memcpy_dtoh(out, 0, 256).unwrap();
+    (program, vec![module_bytes])
+}
+
+/// A job that runs until it is aborted or its limit is reached: 65,535 layers of some milliseconds.
+fn endless(device: &TestDevice) -> Order {
+    let (program, contents) = spin(1_000_000, Some(65_535));
+    device.order(program, &contents)
+}
+
+fn empty(device: &TestDevice) -> Order {
+    device.order(JobProgram::default(), &[])
+}
+
+#[test]
+fn one_runs_one_is_staged_and_a_third_is_refused() {
+    let device = TestDevice::open();
+    let (running, staged, third) = (endless(&device), empty(&device), empty(&device));
+    let jobs = [running.job, staged.job, third.job];
+    device.executor.submit(running).unwrap();
+    assert_eq!(device.next_event(), ExecutorEvent::Started { job: jobs[0] });
+    device.executor.submit(staged).unwrap();
+    assert_eq!(device.executor.submit(third), Err(Busy::Full { job: jobs[2] }));
+
+    device.executor.abort(jobs[0]);
+    let (device_time_ns, outcome) = device.finished(jobs[0]);
+    assert_eq!(outcome, Err(JobFailure::Cancelled));
+    assert!(device_time_ns > 0, "what ran before the abort is charged");
+    assert_eq!(device.next_event(), ExecutorEvent::Started { job: jobs[1] });
+    assert_eq!(device.finished(jobs[1]).1, Ok(Vec::new()));
+}
+
+#[test]
+fn an_aborted_staged_job_never_starts() {
+    let device = TestDevice::open();
+    let (running, staged, next) = (endless(&device), empty(&device), empty(&device));
+    let jobs = [running.job, staged.job, next.job];
+    device.executor.submit(running).unwrap();
+    assert_eq!(device.next_event(), ExecutorEvent::Started { job: jobs[0] });
+    device.executor.submit(staged).unwrap();
+    device.executor.abort(jobs[1]);
+    assert_eq!(
+        device.next_event(),
+        ExecutorEvent::Finished { job: jobs[1], device_time_ns: 0, outcome: Err(JobFailure::Cancelled) }
+    );
+    device.executor.submit(next).unwrap();
+    device.executor.abort(jobs[1]);
+    device.executor.abort(jobs[0]);
+    assert_eq!(device.finished(jobs[0]).1, Err(JobFailure::Cancelled));
+    assert_eq!(device.finished(jobs[2]).1, Ok(Vec::new()));
+}
+
+#[test]
+fn a_wrong_staged_job_ends_while_the_other_runs() {
+    let device = TestDevice::open();
+    let running = endless(&device);
+    let (module, module_bytes) = content(b"not wgsl");
+    let mut program = JobProgram::default();
+    let _ = program.function(module, "main");
+    let staged = device.order(program, &[module_bytes]);
+    let jobs = [running.job, staged.job];
+    device.executor.submit(running).unwrap();
+    assert_eq!(device.next_event(), ExecutorEvent::Started { job: jobs[0] });
+    device.executor.submit(staged).unwrap();
+    assert!(matches!(device.finished(jobs[1]).1, Err(JobFailure::InvalidProgram(_))));
+    device.executor.abort(jobs[0]);
+    assert_eq!(device.finished(jobs[0]).1, Err(JobFailure::Cancelled));
+}
+
+#[test]
+fn a_job_past_its_limit_ends_and_the_device_goes_on() {
+    let device = TestDevice::open();
+    let order = Order { limit: Duration::from_millis(100), ..endless(&device) };
+    assert_eq!(device.run(order), Err(JobFailure::Timeout));
+    let (program, contents) = spin(10, Some(4));
+    assert!(device.run_program(program, &contents).is_ok(), "the device serves the next job");
+}
+
+#[test]
+fn a_launch_that_cannot_be_cut_costs_the_device_and_only_its_own_job() {
+    let device = TestDevice::open();
+    // Calibrated to some five seconds: longer than the executor's patience after the limit, and still bounded.
+    let rounds = 2_000_000;
+    let (program, contents) = spin(rounds, None);
+    let warm_up = device.order(program.clone(), &contents);
+    device.run(warm_up).unwrap();
+    let measured = device.order(program, &contents);
+    let job = measured.job;
+    device.executor.submit(measured).unwrap();
+    let (device_time_ns, _) = device.finished(job);
+    let factor = 5_000_000_000 / device_time_ns.max(1);
+    let long = u32::try_from(u64::from(rounds) * factor).unwrap_or(u32::MAX);
+
+    let (program, contents) = spin(long, None);
+    let hung = Order { limit: Duration::from_millis(50), ..device.order(program, &contents) };
+    let (program, contents) = spin(10, None);
+    let staged = device.order(program, &contents);
+    let jobs = [hung.job, staged.job];
+    device.executor.submit(hung).unwrap();
+    device.executor.submit(staged).unwrap();
+    assert_eq!(device.finished(jobs[0]).1, Err(JobFailure::Timeout));
+    assert!(device.finished(jobs[1]).1.is_ok(), "the staged job ran on the new device");
+    // As long again on the new device: the one left behind has ended before the process does.
+    let (program, contents) = spin(long, None);
+    assert!(device.run_program(program, &contents).is_ok());
+}
