@@ -55,7 +55,7 @@ static MODULE: ModuleSource = wgsl!(
     "shaders/shared/lights.wgsl",
     "shaders/shared/camera.wgsl",
     "shaders/shared/mis.wgsl",
-    "shaders/shared/light_subpath.wgsl",
+    "shaders/shared/walk.wgsl",
     "shaders/eye.wgsl",
     "shaders/light.wgsl",
     "shaders/first_hit.wgsl",
