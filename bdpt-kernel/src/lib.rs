@@ -3,5 +3,11 @@
 //! programs.
 
 pub mod bvh;
+pub mod film;
 pub mod gpu;
+#[cfg(feature = "farm")]
+pub mod job;
+pub mod output;
+pub mod plan;
 pub mod scene;
+pub mod twin;
