@@ -1,8 +1,37 @@
-//! The control plane: gRPC sessions of applications and nodes with the coordinator.
+//! The control plane: gRPC sessions of applications and nodes with the coordinator, package `gleaner.v1`.
+//!
+//! It owns message shapes, their caps and the connection settings that both ends share; it never decides what to say.
 
+mod convert;
 mod session;
+mod transport;
 
-pub use self::session::{
-    ADMIN_TIMEOUT, Session, SessionError, SessionReceiver, SessionSender, connect_app, connect_node, drain,
-    status,
+#[allow(
+    missing_docs,
+    missing_debug_implementations,
+    unreachable_pub,
+    unused_qualifications,
+    elided_lifetimes_in_paths,
+    clippy::all,
+    clippy::pedantic,
+    clippy::restriction,
+    clippy::nursery,
+    reason = "generated from proto/gleaner/v1; tests/generated.rs keeps it in step"
+)]
+#[rustfmt::skip]
+#[path = "../gen/gleaner.v1.rs"]
+pub mod v1;
+
+pub use self::{
+    convert::{
+        MAX_ADDRESSES, MAX_CERTIFICATE_BYTES, MAX_CONTENTS, MAX_ENTRIES, MAX_JOBS, MAX_NAME_BYTES,
+        MAX_TEXT_BYTES, WireError,
+    },
+    session::{
+        Heard, QUEUED_MESSAGES, Session, SessionError, SessionReceiver, SessionSender, connect_app,
+        connect_node, drain, status,
+    },
+    transport::{
+        ADMIN_TIMEOUT, MAX_MESSAGE_BYTES, admin_server, apps_server, incoming, nodes_server, server,
+    },
 };

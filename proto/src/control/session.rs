@@ -1,6 +1,6 @@
-//! The client's end of a control session.
+//! The client's end of a control session, and the operator's requests.
 
-use std::{marker::PhantomData, time::Duration};
+use std::{error::Error, fmt};
 
 use farm_core::{
     coordinator::FarmStatus,
@@ -8,9 +8,17 @@ use farm_core::{
     message::{AppToCoordinator, CoordinatorToApp, CoordinatorToNode, NodeToCoordinator},
 };
 use thiserror::Error;
+use tokio::sync::mpsc;
+use tokio_stream::{StreamExt, wrappers::ReceiverStream};
+use tonic::{Code, Request, Status, Streaming, transport::Channel};
 
-/// How long connecting and each admin request may take.
-pub const ADMIN_TIMEOUT: Duration = Duration::from_secs(5);
+use super::{
+    ADMIN_TIMEOUT, MAX_MESSAGE_BYTES, WireError, transport,
+    v1::{self, admin_client::AdminClient, apps_client::AppsClient, nodes_client::NodesClient},
+};
+
+/// Messages that wait to be sent on a session, at most.
+pub const QUEUED_MESSAGES: usize = 1_024;
 
 /// A session could not be had or ended.
 #[derive(Clone, Debug, PartialEq, Eq, Error)]
@@ -38,25 +46,22 @@ pub enum SessionError {
         reason: String,
     },
     /// The coordinator said something that this build does not understand. Not to be retried.
-    #[error("a message of the coordinator is malformed: {reason}")]
-    Malformed {
-        /// Which field.
-        reason: String,
-    },
-    /// The request was refused (an unknown node, say).
+    #[error("a message of the coordinator is malformed: {0}")]
+    Malformed(#[from] WireError),
+    /// The request was refused (an unknown node, say). Not to be retried.
     #[error("refused by the coordinator: {reason}")]
     Refused {
         /// Why.
         reason: String,
     },
     /// The outgoing queue is full: the coordinator does not read. The caller drops the session.
-    #[error("the session's queue is full")]
+    #[error("{QUEUED_MESSAGES} messages wait for a coordinator that does not read")]
     Full,
 }
 
 /// A session with the coordinator: `S` is what this side says, `R` what it hears.
 #[derive(Debug)]
-pub struct Session<S, R> {
+pub struct Session<S, R: Heard> {
     /// Cloneable; the session ends when the last one is dropped (what is queued is still sent).
     pub sender: SessionSender<S>,
     /// The one reader.
@@ -64,60 +69,107 @@ pub struct Session<S, R> {
 }
 
 /// Sends on a session.
-#[derive(Debug)]
-pub struct SessionSender<S>(PhantomData<S>);
+pub struct SessionSender<S>(mpsc::Sender<S>);
 
 impl<S> Clone for SessionSender<S> {
     fn clone(&self) -> Self {
-        Self(PhantomData)
+        Self(self.0.clone())
+    }
+}
+
+impl<S> fmt::Debug for SessionSender<S> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("SessionSender")
     }
 }
 
 impl<S> SessionSender<S> {
+    /// Queues a message; waits while the queue is full.
+    ///
+    /// # Errors
+    /// [`SessionError::Ended`].
+    pub async fn send(&self, message: S) -> Result<(), SessionError> {
+        self.0.send(message).await.map_err(|_| nobody_listens())
+    }
+
     /// Queues a message without waiting.
     ///
     /// # Errors
     /// [`SessionError::Full`] or [`SessionError::Ended`].
     pub fn try_send(&self, message: S) -> Result<(), SessionError> {
-        let _ = message;
-        unimplemented!()
+        self.0.try_send(message).map_err(|error| match error {
+            mpsc::error::TrySendError::Full(_) => SessionError::Full,
+            mpsc::error::TrySendError::Closed(_) => nobody_listens(),
+        })
     }
+}
+
+fn nobody_listens() -> SessionError {
+    SessionError::Ended { reason: "the connection is closed".to_owned() }
+}
+
+/// What a session's client hears; each has its shape on the wire.
+pub trait Heard: TryFrom<Self::Wire, Error = WireError> + Send + 'static {
+    /// The generated message.
+    type Wire: fmt::Debug + Send + 'static;
+}
+
+impl Heard for CoordinatorToApp {
+    type Wire = v1::CoordinatorToApp;
+}
+
+impl Heard for CoordinatorToNode {
+    type Wire = v1::CoordinatorToNode;
 }
 
 /// Receives on a session.
 #[derive(Debug)]
-pub struct SessionReceiver<R>(PhantomData<R>);
+pub struct SessionReceiver<R: Heard>(Streaming<R::Wire>);
 
-impl<R> SessionReceiver<R> {
+impl<R: Heard> SessionReceiver<R> {
     /// The next message. Cancel-safe.
     ///
     /// # Errors
     /// The session ended, or a message is malformed.
     pub async fn recv(&mut self) -> Result<R, SessionError> {
-        unimplemented!()
+        match self.0.message().await {
+            Ok(Some(message)) => Ok(R::try_from(message)?),
+            Ok(None) => Err(SessionError::Ended { reason: "closed by the coordinator".to_owned() }),
+            Err(status) => Err(SessionError::Ended { reason: words(&status) }),
+        }
     }
 }
 
-/// Opens an application's session with the coordinator at `HOST:PORT`.
+/// Opens an application's session with the coordinator at `HOST:PORT`. The hello is the caller's first message.
 ///
 /// # Errors
 /// Nobody answers within [`ADMIN_TIMEOUT`].
 pub async fn connect_app(
     coordinator: &str,
 ) -> Result<Session<AppToCoordinator, CoordinatorToApp>, SessionError> {
-    let _ = coordinator;
-    unimplemented!()
+    let mut client = AppsClient::new(channel(coordinator).await?)
+        .max_decoding_message_size(MAX_MESSAGE_BYTES)
+        .max_encoding_message_size(MAX_MESSAGE_BYTES);
+    let (sender, queue) = mpsc::channel(QUEUED_MESSAGES);
+    let outgoing = ReceiverStream::new(queue).map(v1::AppToCoordinator::from);
+    let answer = within_timeout(coordinator, client.session(outgoing)).await?;
+    Ok(Session { sender: SessionSender(sender), receiver: SessionReceiver(answer.into_inner()) })
 }
 
-/// Opens a node's session with the coordinator at `HOST:PORT`.
+/// Opens a node's session with the coordinator at `HOST:PORT`. The hello is the caller's first message.
 ///
 /// # Errors
 /// Nobody answers within [`ADMIN_TIMEOUT`].
 pub async fn connect_node(
     coordinator: &str,
 ) -> Result<Session<NodeToCoordinator, CoordinatorToNode>, SessionError> {
-    let _ = coordinator;
-    unimplemented!()
+    let mut client = NodesClient::new(channel(coordinator).await?)
+        .max_decoding_message_size(MAX_MESSAGE_BYTES)
+        .max_encoding_message_size(MAX_MESSAGE_BYTES);
+    let (sender, queue) = mpsc::channel(QUEUED_MESSAGES);
+    let outgoing = ReceiverStream::new(queue).map(v1::NodeToCoordinator::from);
+    let answer = within_timeout(coordinator, client.session(outgoing)).await?;
+    Ok(Session { sender: SessionSender(sender), receiver: SessionReceiver(answer.into_inner()) })
 }
 
 /// Asks the coordinator at `HOST:PORT` how the farm stands.
@@ -125,8 +177,9 @@ pub async fn connect_node(
 /// # Errors
 /// Nobody answers within [`ADMIN_TIMEOUT`].
 pub async fn status(coordinator: &str) -> Result<FarmStatus, SessionError> {
-    let _ = coordinator;
-    unimplemented!()
+    let mut client = admin(coordinator).await?;
+    let answer = within_timeout(coordinator, client.status(Request::new(v1::StatusRequest {}))).await?;
+    Ok(answer.into_inner().try_into()?)
 }
 
 /// Asks a node to finish what it has and leave.
@@ -134,6 +187,51 @@ pub async fn status(coordinator: &str) -> Result<FarmStatus, SessionError> {
 /// # Errors
 /// Nobody answers, or the node is unknown.
 pub async fn drain(coordinator: &str, node: NodeId) -> Result<(), SessionError> {
-    let _ = (coordinator, node);
-    unimplemented!()
+    let mut client = admin(coordinator).await?;
+    within_timeout(coordinator, client.drain(Request::new(v1::DrainRequest { node: node.0 }))).await?;
+    Ok(())
+}
+
+async fn admin(coordinator: &str) -> Result<AdminClient<Channel>, SessionError> {
+    Ok(AdminClient::new(channel(coordinator).await?)
+        .max_decoding_message_size(MAX_MESSAGE_BYTES)
+        .max_encoding_message_size(MAX_MESSAGE_BYTES))
+}
+
+async fn channel(coordinator: &str) -> Result<Channel, SessionError> {
+    transport::endpoint(coordinator)?.connect().await.map_err(|error| SessionError::Unreachable {
+        address: coordinator.to_owned(),
+        reason: root_cause(&error),
+    })
+}
+
+async fn within_timeout<T>(
+    coordinator: &str,
+    request: impl Future<Output = Result<T, Status>>,
+) -> Result<T, SessionError> {
+    let unreachable = |reason| SessionError::Unreachable { address: coordinator.to_owned(), reason };
+    match tokio::time::timeout(ADMIN_TIMEOUT, request).await {
+        Err(_) => Err(unreachable(format!("no answer within {ADMIN_TIMEOUT:?}"))),
+        Ok(Ok(answer)) => Ok(answer),
+        Ok(Err(status)) if matches!(status.code(), Code::NotFound | Code::InvalidArgument) => {
+            Err(SessionError::Refused { reason: status.message().to_owned() })
+        }
+        Ok(Err(status)) => Err(unreachable(words(&status))),
+    }
+}
+
+fn words(status: &Status) -> String {
+    match status.message() {
+        "" => root_cause(status),
+        message => message.to_owned(),
+    }
+}
+
+/// The innermost error says what happened ("connection refused"); the outer ones say "transport error".
+fn root_cause(error: &dyn Error) -> String {
+    let mut cause = error;
+    while let Some(source) = cause.source() {
+        cause = source;
+    }
+    cause.to_string()
 }

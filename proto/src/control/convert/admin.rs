@@ -1,0 +1,140 @@
+//! Operators and the coordinator.
+
+use farm_core::{
+    coordinator::{AppStatus, DeviceStatus, FarmStatus, NodeState, NodeStatus},
+    id::{AppId, Epoch, NodeId},
+};
+
+use super::{
+    MAX_ENTRIES, WireError, device, enumeration, list,
+    model::{addresses, device_kind},
+    name, score, weight,
+};
+use crate::control::v1;
+
+impl From<FarmStatus> for v1::FarmStatus {
+    fn from(status: FarmStatus) -> Self {
+        Self {
+            epoch: status.epoch.0,
+            nodes: status.nodes.into_iter().map(Into::into).collect(),
+            apps: status.apps.into_iter().map(Into::into).collect(),
+            delivered_jobs: status.delivered_jobs,
+            replanned_jobs: status.replanned_jobs,
+        }
+    }
+}
+
+impl TryFrom<v1::FarmStatus> for FarmStatus {
+    type Error = WireError;
+
+    fn try_from(wire: v1::FarmStatus) -> Result<Self, WireError> {
+        Ok(Self {
+            epoch: Epoch(wire.epoch),
+            nodes: list("FarmStatus.nodes", MAX_ENTRIES, wire.nodes)?,
+            apps: list("FarmStatus.apps", MAX_ENTRIES, wire.apps)?,
+            delivered_jobs: wire.delivered_jobs,
+            replanned_jobs: wire.replanned_jobs,
+        })
+    }
+}
+
+impl From<NodeStatus> for v1::NodeStatus {
+    fn from(node: NodeStatus) -> Self {
+        let state = match node.state {
+            NodeState::Alive => v1::NodeState::Alive,
+            NodeState::Suspect => v1::NodeState::Suspect,
+            NodeState::Draining => v1::NodeState::Draining,
+        };
+        Self {
+            node: node.node.0,
+            name: node.name,
+            state: state.into(),
+            addresses: node.addresses,
+            devices: node.devices.into_iter().map(Into::into).collect(),
+        }
+    }
+}
+
+impl TryFrom<v1::NodeStatus> for NodeStatus {
+    type Error = WireError;
+
+    fn try_from(wire: v1::NodeStatus) -> Result<Self, WireError> {
+        const STATE: &str = "NodeStatus.state";
+        Ok(Self {
+            node: NodeId(wire.node),
+            name: name("NodeStatus.name", wire.name)?,
+            state: match enumeration(STATE, wire.state)? {
+                v1::NodeState::Unspecified => return Err(WireError::Missing { field: STATE }),
+                v1::NodeState::Alive => NodeState::Alive,
+                v1::NodeState::Suspect => NodeState::Suspect,
+                v1::NodeState::Draining => NodeState::Draining,
+            },
+            addresses: addresses("NodeStatus.addresses", wire.addresses)?,
+            devices: list("NodeStatus.devices", MAX_ENTRIES, wire.devices)?,
+        })
+    }
+}
+
+impl From<DeviceStatus> for v1::DeviceStatus {
+    fn from(device: DeviceStatus) -> Self {
+        Self {
+            device: device.device.0.into(),
+            name: device.name,
+            kind: v1::DeviceKind::from(device.kind).into(),
+            score: device.score,
+            planned_jobs: device.planned_jobs,
+            running_jobs: device.running_jobs,
+            executed_jobs: device.executed_jobs,
+            device_time_ns: device.device_time_ns,
+        }
+    }
+}
+
+impl TryFrom<v1::DeviceStatus> for DeviceStatus {
+    type Error = WireError;
+
+    fn try_from(wire: v1::DeviceStatus) -> Result<Self, WireError> {
+        Ok(Self {
+            device: device("DeviceStatus.device", wire.device)?,
+            name: name("DeviceStatus.name", wire.name)?,
+            kind: device_kind("DeviceStatus.kind", wire.kind)?,
+            score: score("DeviceStatus.score", wire.score)?,
+            planned_jobs: wire.planned_jobs,
+            running_jobs: wire.running_jobs,
+            executed_jobs: wire.executed_jobs,
+            device_time_ns: wire.device_time_ns,
+        })
+    }
+}
+
+impl From<AppStatus> for v1::AppStatus {
+    fn from(app: AppStatus) -> Self {
+        Self {
+            app: app.app.0,
+            name: app.name,
+            weight: app.weight,
+            connected: app.connected,
+            waiting_jobs: app.waiting_jobs,
+            outstanding_jobs: app.outstanding_jobs,
+            delivered_jobs: app.delivered_jobs,
+            device_time_ns: app.device_time_ns,
+        }
+    }
+}
+
+impl TryFrom<v1::AppStatus> for AppStatus {
+    type Error = WireError;
+
+    fn try_from(wire: v1::AppStatus) -> Result<Self, WireError> {
+        Ok(Self {
+            app: AppId(wire.app),
+            name: name("AppStatus.name", wire.name)?,
+            weight: weight("AppStatus.weight", wire.weight)?,
+            connected: wire.connected,
+            waiting_jobs: wire.waiting_jobs,
+            outstanding_jobs: wire.outstanding_jobs,
+            delivered_jobs: wire.delivered_jobs,
+            device_time_ns: wire.device_time_ns,
+        })
+    }
+}

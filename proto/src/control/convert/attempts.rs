@@ -1,0 +1,122 @@
+//! Lists of jobs and attempts as columns of differences: a job of a plan costs about two bytes.
+
+use farm_core::id::{AppId, Attempt, Epoch, JobAttempt, JobId, JobIndex, TaskId};
+
+use super::{MAX_JOBS, WireError, invalid, within};
+use crate::control::v1;
+
+impl From<&[JobAttempt]> for v1::Attempts {
+    fn from(jobs: &[JobAttempt]) -> Self {
+        let key = |job: &JobAttempt| (job.job.app, job.job.task, job.attempt.epoch);
+        let runs = jobs.chunk_by(|before, after| key(before) == key(after)).map(|run| {
+            let (app, task, epoch) = key(&run[0]);
+            let mut index = IndexColumn::default();
+            let mut sequence = SequenceColumn::default();
+            v1::AttemptRun {
+                app: app.0,
+                task: task.0,
+                epoch: epoch.0,
+                index_deltas: run.iter().map(|job| index.delta(job.job.index)).collect(),
+                sequence_deltas: run.iter().map(|job| sequence.delta(job.attempt.sequence)).collect(),
+            }
+        });
+        Self { runs: runs.collect() }
+    }
+}
+
+impl TryFrom<v1::Attempts> for Vec<JobAttempt> {
+    type Error = WireError;
+
+    fn try_from(wire: v1::Attempts) -> Result<Self, WireError> {
+        let count = wire.runs.iter().map(|run| run.index_deltas.len()).sum();
+        within("Attempts.runs", count, MAX_JOBS)?;
+        let mut jobs = Self::with_capacity(count);
+        for run in wire.runs {
+            if run.index_deltas.len() != run.sequence_deltas.len() {
+                return Err(invalid(
+                    "AttemptRun.sequence_deltas",
+                    format!("{} of them", run.sequence_deltas.len()),
+                ));
+            }
+            let (app, task, epoch) = (AppId(run.app), TaskId(run.task), Epoch(run.epoch));
+            let mut index = IndexColumn::default();
+            let mut sequence = SequenceColumn::default();
+            for (index_delta, sequence_delta) in run.index_deltas.into_iter().zip(run.sequence_deltas) {
+                let index = index.next("AttemptRun.index_deltas", index_delta)?;
+                let attempt = Attempt { epoch, sequence: sequence.next(sequence_delta) };
+                jobs.push(JobAttempt { job: JobId { app, task, index }, attempt });
+            }
+        }
+        Ok(jobs)
+    }
+}
+
+impl From<&[JobId]> for v1::JobIds {
+    fn from(jobs: &[JobId]) -> Self {
+        let runs =
+            jobs.chunk_by(|before, after| (before.app, before.task) == (after.app, after.task)).map(|run| {
+                let mut index = IndexColumn::default();
+                v1::JobRun {
+                    app: run[0].app.0,
+                    task: run[0].task.0,
+                    index_deltas: run.iter().map(|job| index.delta(job.index)).collect(),
+                }
+            });
+        Self { runs: runs.collect() }
+    }
+}
+
+impl TryFrom<v1::JobIds> for Vec<JobId> {
+    type Error = WireError;
+
+    fn try_from(wire: v1::JobIds) -> Result<Self, WireError> {
+        let count = wire.runs.iter().map(|run| run.index_deltas.len()).sum();
+        within("JobIds.runs", count, MAX_JOBS)?;
+        let mut jobs = Self::with_capacity(count);
+        for run in wire.runs {
+            let mut index = IndexColumn::default();
+            for delta in run.index_deltas {
+                let index = index.next("JobRun.index_deltas", delta)?;
+                jobs.push(JobId { app: AppId(run.app), task: TaskId(run.task), index });
+            }
+        }
+        Ok(jobs)
+    }
+}
+
+/// A column of job indices as differences.
+#[derive(Default)]
+pub(super) struct IndexColumn(u32);
+
+impl IndexColumn {
+    /// What to write for the next index.
+    pub(super) fn delta(&mut self, index: JobIndex) -> i64 {
+        let delta = i64::from(index.0) - i64::from(self.0);
+        self.0 = index.0;
+        delta
+    }
+
+    /// The next index for what was read.
+    pub(super) fn next(&mut self, field: &'static str, delta: i64) -> Result<JobIndex, WireError> {
+        let index = i64::from(self.0).checked_add(delta).and_then(|index| u32::try_from(index).ok());
+        self.0 = index.ok_or_else(|| invalid(field, delta))?;
+        Ok(JobIndex(self.0))
+    }
+}
+
+/// A column of attempt sequences as differences modulo 2^64.
+#[derive(Default)]
+struct SequenceColumn(u64);
+
+impl SequenceColumn {
+    fn delta(&mut self, sequence: u64) -> i64 {
+        let delta = sequence.wrapping_sub(self.0).cast_signed();
+        self.0 = sequence;
+        delta
+    }
+
+    fn next(&mut self, delta: i64) -> u64 {
+        self.0 = self.0.wrapping_add_signed(delta);
+        self.0
+    }
+}

@@ -1,0 +1,195 @@
+//! Worker nodes and the coordinator.
+
+use farm_core::{
+    id::{AppId, Epoch, JobAttempt, NodeId, NodeSession},
+    message::{CoordinatorToNode, DeviceLoad, Executed, JobFailure, NodeHello, NodeToCoordinator},
+};
+
+use super::{MAX_ENTRIES, WireError, cut, device, invalid, list, name, required, text, weight, within};
+use crate::control::v1;
+
+impl From<NodeToCoordinator> for v1::NodeToCoordinator {
+    fn from(message: NodeToCoordinator) -> Self {
+        use v1::node_to_coordinator::Message;
+        let message = match message {
+            NodeToCoordinator::Hello(hello) => Message::Hello(hello.into()),
+            NodeToCoordinator::Heartbeat { sequence, devices, spool_bytes } => {
+                let devices = devices.into_iter().map(Into::into).collect();
+                Message::Heartbeat(v1::NodeHeartbeat { sequence, devices, spool_bytes })
+            }
+            NodeToCoordinator::Report { executed, delivered } => {
+                Message::Report(report(executed, &delivered))
+            }
+            NodeToCoordinator::DeviceLost { device, reason } => {
+                Message::DeviceLost(v1::DeviceLost { device: device.0.into(), reason: cut(reason) })
+            }
+            NodeToCoordinator::Goodbye => Message::Goodbye(v1::Nothing {}),
+        };
+        Self { message: Some(message) }
+    }
+}
+
+impl TryFrom<v1::NodeToCoordinator> for NodeToCoordinator {
+    type Error = WireError;
+
+    fn try_from(wire: v1::NodeToCoordinator) -> Result<Self, WireError> {
+        use v1::node_to_coordinator::Message;
+        Ok(match required("NodeToCoordinator.message", wire.message)? {
+            Message::Hello(hello) => Self::Hello(hello.try_into()?),
+            Message::Heartbeat(heartbeat) => {
+                within("NodeHeartbeat.devices", heartbeat.devices.len(), MAX_ENTRIES)?;
+                Self::Heartbeat {
+                    sequence: heartbeat.sequence,
+                    devices: heartbeat.devices.into_iter().map(Into::into).collect(),
+                    spool_bytes: heartbeat.spool_bytes,
+                }
+            }
+            Message::Report(report) => {
+                let delivered = required("Report.delivered", report.delivered.clone())?.try_into()?;
+                Self::Report { executed: executed(report)?, delivered }
+            }
+            Message::DeviceLost(lost) => Self::DeviceLost {
+                device: device("DeviceLost.device", lost.device)?,
+                reason: text("DeviceLost.reason", lost.reason)?,
+            },
+            Message::Goodbye(v1::Nothing {}) => Self::Goodbye,
+        })
+    }
+}
+
+impl From<NodeHello> for v1::NodeHello {
+    fn from(hello: NodeHello) -> Self {
+        Self {
+            protocol: hello.protocol,
+            name: hello.name,
+            session: hello.session.0,
+            devices: hello.devices.into_iter().map(Into::into).collect(),
+            contact: Some(hello.contact.into()),
+            inventory: Some(hello.inventory.as_slice().into()),
+        }
+    }
+}
+
+impl TryFrom<v1::NodeHello> for NodeHello {
+    type Error = WireError;
+
+    fn try_from(wire: v1::NodeHello) -> Result<Self, WireError> {
+        Ok(Self {
+            protocol: wire.protocol,
+            name: name("NodeHello.name", wire.name)?,
+            session: NodeSession(wire.session),
+            devices: list("NodeHello.devices", MAX_ENTRIES, wire.devices)?,
+            contact: required("NodeHello.contact", wire.contact)?.try_into()?,
+            inventory: required("NodeHello.inventory", wire.inventory)?.try_into()?,
+        })
+    }
+}
+
+impl From<DeviceLoad> for v1::DeviceLoad {
+    fn from(load: DeviceLoad) -> Self {
+        Self { queued_jobs: load.queued_jobs, running_jobs: load.running_jobs }
+    }
+}
+
+impl From<v1::DeviceLoad> for DeviceLoad {
+    fn from(wire: v1::DeviceLoad) -> Self {
+        Self { queued_jobs: wire.queued_jobs, running_jobs: wire.running_jobs }
+    }
+}
+
+fn report(executed: Vec<Executed>, delivered: &[JobAttempt]) -> v1::Report {
+    let jobs: Vec<JobAttempt> = executed.iter().map(|done| done.job).collect();
+    let executed_devices = executed.iter().map(|done| done.device.0.into()).collect();
+    let executed_device_time_ns = executed.iter().map(|done| done.device_time_ns).collect();
+    // A report of 2^32 executions would be over the message cap long before.
+    let failures = (0_u32..).zip(executed).filter_map(|(position, done)| {
+        Some(v1::ExecutedFailure { position, failure: Some(done.failure?.into()) })
+    });
+    v1::Report {
+        executed: Some(jobs.as_slice().into()),
+        executed_devices,
+        executed_device_time_ns,
+        failures: failures.collect(),
+        delivered: Some(delivered.into()),
+    }
+}
+
+/// The executions of a report. The columns are of one length; each failure names a position, increasing.
+fn executed(wire: v1::Report) -> Result<Vec<Executed>, WireError> {
+    let jobs: Vec<JobAttempt> = required("Report.executed", wire.executed)?.try_into()?;
+    for (field, length) in [
+        ("Report.executed_devices", wire.executed_devices.len()),
+        ("Report.executed_device_time_ns", wire.executed_device_time_ns.len()),
+    ] {
+        if length != jobs.len() {
+            return Err(invalid(field, format!("{length} entries for {} executions", jobs.len())));
+        }
+    }
+    let mut failures = wire.failures.into_iter().peekable();
+    let mut executed = Vec::with_capacity(jobs.len());
+    let columns = jobs.into_iter().zip(wire.executed_devices).zip(wire.executed_device_time_ns);
+    for (position, ((job, index), device_time_ns)) in (0_u32..).zip(columns) {
+        let failure = failures.next_if(|failure| failure.position == position).map(failure_of).transpose()?;
+        executed.push(Executed {
+            job,
+            device: device("Report.executed_devices", index)?,
+            device_time_ns,
+            failure,
+        });
+    }
+    match failures.next() {
+        None => Ok(executed),
+        Some(stray) => Err(invalid("ExecutedFailure.position", stray.position)),
+    }
+}
+
+fn failure_of(wire: v1::ExecutedFailure) -> Result<JobFailure, WireError> {
+    required("ExecutedFailure.failure", wire.failure)?.try_into()
+}
+
+impl From<CoordinatorToNode> for v1::CoordinatorToNode {
+    fn from(message: CoordinatorToNode) -> Self {
+        use v1::coordinator_to_node::Message;
+        let message = match message {
+            CoordinatorToNode::Welcome { node, epoch, liveness } => Message::Welcome(v1::NodeWelcome {
+                node: node.0,
+                epoch: epoch.0,
+                liveness: Some(liveness.into()),
+            }),
+            CoordinatorToNode::Refused { reason } => Message::Refused(v1::Refused { reason: cut(reason) }),
+            CoordinatorToNode::AppJoined { app, weight } => {
+                Message::AppJoined(v1::AppJoined { app: app.0, weight })
+            }
+            CoordinatorToNode::AppLeft { app } => Message::AppLeft(v1::AppLeft { app: app.0 }),
+            CoordinatorToNode::Cancel { jobs } => Message::Cancel(jobs.as_slice().into()),
+            CoordinatorToNode::Drain => Message::Drain(v1::Nothing {}),
+            CoordinatorToNode::HeartbeatAck { sequence } => {
+                Message::HeartbeatAck(v1::HeartbeatAck { sequence })
+            }
+        };
+        Self { message: Some(message) }
+    }
+}
+
+impl TryFrom<v1::CoordinatorToNode> for CoordinatorToNode {
+    type Error = WireError;
+
+    fn try_from(wire: v1::CoordinatorToNode) -> Result<Self, WireError> {
+        use v1::coordinator_to_node::Message;
+        Ok(match required("CoordinatorToNode.message", wire.message)? {
+            Message::Welcome(welcome) => Self::Welcome {
+                node: NodeId(welcome.node),
+                epoch: Epoch(welcome.epoch),
+                liveness: required("NodeWelcome.liveness", welcome.liveness)?.into(),
+            },
+            Message::Refused(refused) => Self::Refused { reason: text("Refused.reason", refused.reason)? },
+            Message::AppJoined(joined) => {
+                Self::AppJoined { app: AppId(joined.app), weight: weight("AppJoined.weight", joined.weight)? }
+            }
+            Message::AppLeft(v1::AppLeft { app }) => Self::AppLeft { app: AppId(app) },
+            Message::Cancel(jobs) => Self::Cancel { jobs: jobs.try_into()? },
+            Message::Drain(v1::Nothing {}) => Self::Drain,
+            Message::HeartbeatAck(v1::HeartbeatAck { sequence }) => Self::HeartbeatAck { sequence },
+        })
+    }
+}

@@ -1,0 +1,84 @@
+//! Settings of the gRPC connections, the same at both ends.
+
+use std::time::Duration;
+
+use tokio::net::TcpListener;
+use tonic::transport::{Endpoint, Server, server::TcpIncoming};
+
+use super::{SessionError, v1};
+
+/// How long connecting and each admin request may take.
+pub const ADMIN_TIMEOUT: Duration = Duration::from_secs(5);
+/// Most bytes of one message, in either direction.
+pub const MAX_MESSAGE_BYTES: usize = 16 << 20;
+/// HTTP/2 pings go this often (off by default).
+const KEEP_ALIVE: Duration = Duration::from_secs(5);
+/// A connection that does not answer a ping for this long is closed.
+const KEEP_ALIVE_TIMEOUT: Duration = Duration::from_secs(5);
+/// Unread bytes of one session, at most: a plan of 4,096 jobs is about 10 kB.
+const STREAM_WINDOW_BYTES: u32 = 4 << 20;
+/// Unread bytes of one connection, at most.
+const CONNECTION_WINDOW_BYTES: u32 = 8 << 20;
+/// Sessions and requests of one connection at a time.
+const STREAMS_PER_CONNECTION: u32 = 64;
+
+/// A gRPC server with the farm's keepalive, windows and stream limits; serve it on [`incoming`].
+#[must_use]
+pub fn server() -> Server {
+    Server::builder()
+        .http2_keepalive_interval(Some(KEEP_ALIVE))
+        .http2_keepalive_timeout(Some(KEEP_ALIVE_TIMEOUT))
+        .initial_stream_window_size(STREAM_WINDOW_BYTES)
+        .initial_connection_window_size(CONNECTION_WINDOW_BYTES)
+        .max_concurrent_streams(STREAMS_PER_CONNECTION)
+}
+
+/// The accepted connections of a listener, without Nagle's delay.
+#[must_use]
+pub fn incoming(listener: TcpListener) -> TcpIncoming {
+    TcpIncoming::from(listener).with_nodelay(Some(true))
+}
+
+/// The service of applications, with message caps.
+pub fn apps_server<A: v1::apps_server::Apps>(apps: A) -> v1::apps_server::AppsServer<A> {
+    v1::apps_server::AppsServer::new(apps)
+        .max_decoding_message_size(MAX_MESSAGE_BYTES)
+        .max_encoding_message_size(MAX_MESSAGE_BYTES)
+}
+
+/// The service of worker nodes, with message caps.
+pub fn nodes_server<N: v1::nodes_server::Nodes>(nodes: N) -> v1::nodes_server::NodesServer<N> {
+    v1::nodes_server::NodesServer::new(nodes)
+        .max_decoding_message_size(MAX_MESSAGE_BYTES)
+        .max_encoding_message_size(MAX_MESSAGE_BYTES)
+}
+
+/// The service of operators, with message caps.
+pub fn admin_server<A: v1::admin_server::Admin>(admin: A) -> v1::admin_server::AdminServer<A> {
+    v1::admin_server::AdminServer::new(admin)
+        .max_decoding_message_size(MAX_MESSAGE_BYTES)
+        .max_encoding_message_size(MAX_MESSAGE_BYTES)
+}
+
+/// The client's end of a connection to `HOST:PORT`.
+pub(super) fn endpoint(coordinator: &str) -> Result<Endpoint, SessionError> {
+    let bad =
+        |reason: &str| SessionError::Address { address: coordinator.to_owned(), reason: reason.to_owned() };
+    let (host, port) = coordinator.rsplit_once(':').ok_or_else(|| bad("the port is missing"))?;
+    if host.is_empty() {
+        return Err(bad("the host is missing"));
+    }
+    if !port.parse::<u16>().is_ok_and(|port| port > 0) {
+        return Err(bad("the port is not a number from 1 to 65535"));
+    }
+    let endpoint =
+        Endpoint::from_shared(format!("http://{coordinator}")).map_err(|error| bad(&error.to_string()))?;
+    Ok(endpoint
+        .connect_timeout(ADMIN_TIMEOUT)
+        .tcp_nodelay(true)
+        .http2_keep_alive_interval(KEEP_ALIVE)
+        .keep_alive_timeout(KEEP_ALIVE_TIMEOUT)
+        .keep_alive_while_idle(true)
+        .initial_stream_window_size(STREAM_WINDOW_BYTES)
+        .initial_connection_window_size(CONNECTION_WINDOW_BYTES))
+}

@@ -1,0 +1,460 @@
+//! Every message of the control plane survives its way over the wire, and what is not allowed is refused by field.
+
+use std::fmt;
+
+use farm_core::{
+    coordinator::{AppStatus, DeviceStatus, FarmStatus, NodeState, NodeStatus},
+    device::{DeviceInfo, DeviceKind, Features, Limits, Requirements, SimulatedDevices},
+    id::{
+        AppId, AppIncarnation, Attempt, BatchId, ContentHash, DeviceIndex, Epoch, JobAttempt, JobId,
+        JobIndex, NodeId, NodeSession, TaskId,
+    },
+    message::{
+        AppHello, AppToCoordinator, Contact, CoordinatorToApp, CoordinatorToNode, CostNs, DeviceLoad,
+        DevicePlan, Executed, JobFailure, Liveness, NodeHello, NodePlan, NodeToCoordinator, Plan, PlanJob,
+        PlanRequest, WaitReason,
+    },
+    program::Content,
+};
+use proptest::{collection::vec, option, prelude::*};
+use prost::Message;
+use proto::control::{MAX_TEXT_BYTES, WireError, v1};
+
+/// Out, over bytes, and in again.
+fn over_the_wire<D, W>(message: D) -> D
+where
+    W: From<D> + Message + Default,
+    D: TryFrom<W>,
+    <D as TryFrom<W>>::Error: fmt::Debug,
+{
+    let bytes = W::from(message).encode_to_vec();
+    D::try_from(W::decode(bytes.as_slice()).unwrap()).unwrap()
+}
+
+fn attempts() -> impl Strategy<Value = Vec<JobAttempt>> {
+    // Few applications and tasks, so that runs form; any index and sequence, so that differences go both ways.
+    let attempt = (0_u64..3, 0_u32..2, prop_oneof![0_u32..50, any::<u32>()], 1_u32..3, any::<u64>());
+    vec(attempt, 0..40).prop_map(|attempts| {
+        let attempts = attempts.into_iter().map(|(app, task, index, epoch, sequence)| JobAttempt {
+            job: JobId { app: AppId(app), task: TaskId(task), index: JobIndex(index) },
+            attempt: Attempt { epoch: Epoch(epoch), sequence },
+        });
+        attempts.collect()
+    })
+}
+
+fn jobs() -> impl Strategy<Value = Vec<JobId>> {
+    attempts().prop_map(|attempts| attempts.into_iter().map(|attempt| attempt.job).collect())
+}
+
+fn positive() -> impl Strategy<Value = f64> {
+    f64::MIN_POSITIVE..f64::MAX
+}
+
+fn limits() -> impl Strategy<Value = Limits> {
+    (any::<[u64; 3]>(), any::<[u32; 3]>()).prop_map(|(wide, narrow)| Limits {
+        memory_bytes: wide[0],
+        buffer_bytes: wide[1],
+        binding_bytes: wide[2],
+        storage_buffers: narrow[0],
+        workgroup_memory_bytes: narrow[1],
+        workgroup_invocations: narrow[2],
+    })
+}
+
+fn kind() -> impl Strategy<Value = DeviceKind> {
+    prop::sample::select(vec![DeviceKind::Gpu, DeviceKind::Cpu, DeviceKind::Simulated])
+}
+
+fn device_info() -> impl Strategy<Value = DeviceInfo> {
+    ("\\PC{0,40}", kind(), 0.0..f64::MAX, any::<u32>(), limits()).prop_map(
+        |(name, kind, score, features, limits)| DeviceInfo {
+            name,
+            kind,
+            score,
+            features: Features(features),
+            limits,
+        },
+    )
+}
+
+fn requirements() -> impl Strategy<Value = Requirements> {
+    (any::<u32>(), limits(), any::<bool>()).prop_map(|(features, limits, simulated)| Requirements {
+        features: Features(features),
+        limits,
+        simulated: if simulated { SimulatedDevices::Accepted } else { SimulatedDevices::Refused },
+    })
+}
+
+fn contact() -> impl Strategy<Value = Contact> {
+    (vec("[a-z0-9.:]{1,30}", 0..4), vec(any::<u8>(), 0..600))
+        .prop_map(|(addresses, certificate_der)| Contact { addresses, certificate_der })
+}
+
+fn liveness() -> impl Strategy<Value = Liveness> {
+    any::<[u64; 4]>().prop_map(|ms| Liveness {
+        heartbeat_ms: ms[0],
+        suspect_ms: ms[1],
+        dead_ms: ms[2],
+        reconnect_ms: ms[3],
+    })
+}
+
+fn contents() -> impl Strategy<Value = Vec<Content>> {
+    let content = any::<([u8; 32], u64)>()
+        .prop_map(|(hash, size_bytes)| Content { hash: ContentHash(hash), size_bytes });
+    vec(content, 0..5)
+}
+
+fn failure() -> impl Strategy<Value = JobFailure> {
+    prop_oneof![
+        "\\PC{0,80}".prop_map(JobFailure::InvalidProgram),
+        Just(JobFailure::Timeout),
+        "\\PC{0,80}".prop_map(JobFailure::DeviceLost),
+        "\\PC{0,80}".prop_map(JobFailure::OutOfMemory),
+        any::<[u8; 32]>().prop_map(|hash| JobFailure::ContentUnavailable(ContentHash(hash))),
+        "\\PC{0,80}".prop_map(JobFailure::Poison),
+        Just(JobFailure::Cancelled),
+        Just(JobFailure::Returned),
+    ]
+}
+
+fn app_to_coordinator() -> impl Strategy<Value = AppToCoordinator> {
+    let hello = (any::<u32>(), "\\PC{0,40}", positive(), option::of(any::<(u64, u32)>())).prop_map(
+        |(protocol, name, weight, resume)| {
+            let resume = resume.map(|(app, life)| (AppId(app), AppIncarnation(life)));
+            AppToCoordinator::Hello(AppHello { protocol, name, weight, resume })
+        },
+    );
+    let job = |cost: BoxedStrategy<u64>| {
+        (prop_oneof![0_u32..50, any::<u32>()], cost)
+            .prop_map(|(index, cost)| PlanJob { index: JobIndex(index), cost: CostNs(cost) })
+    };
+    let jobs_of = prop_oneof![
+        vec(job(Just(0).boxed()), 0..40),
+        vec(job(Just(7_000_000).boxed()), 0..40),
+        vec(job(any::<u64>().boxed()), 0..40),
+    ];
+    let plan = (any::<u64>(), any::<u32>(), jobs_of, requirements(), contents()).prop_map(
+        |(batch, task, jobs, needs, contents)| {
+            AppToCoordinator::Plan(PlanRequest {
+                batch: BatchId(batch),
+                task: TaskId(task),
+                jobs,
+                needs,
+                contents,
+            })
+        },
+    );
+    prop_oneof![
+        hello,
+        plan,
+        jobs().prop_map(AppToCoordinator::AlreadyDelivered),
+        any::<(u64, u64)>().prop_map(|(node, session)| AppToCoordinator::Unreachable {
+            node: NodeId(node),
+            session: NodeSession(session)
+        }),
+        any::<u32>().prop_map(|task| AppToCoordinator::Cancel(TaskId(task))),
+        any::<u64>().prop_map(|sequence| AppToCoordinator::Heartbeat { sequence }),
+        Just(AppToCoordinator::Goodbye),
+    ]
+}
+
+fn coordinator_to_app() -> impl Strategy<Value = CoordinatorToApp> {
+    let device_plan = (any::<u16>(), attempts())
+        .prop_map(|(device, jobs)| DevicePlan { device: DeviceIndex(device), jobs });
+    let node_plan = (any::<(u64, u64)>(), contact(), vec(device_plan, 0..4)).prop_map(
+        |((node, session), contact, devices)| NodePlan {
+            node: NodeId(node),
+            session: NodeSession(session),
+            contact,
+            devices,
+        },
+    );
+    let plan = (option::of(any::<u64>()), vec(node_plan, 0..4))
+        .prop_map(|(batch, nodes)| CoordinatorToApp::Plan(Plan { batch: batch.map(BatchId), nodes }));
+    let reason = prop::sample::select(vec![WaitReason::NoNode, WaitReason::NoFittingDevice]);
+    prop_oneof![
+        (any::<(u64, u32, u32)>(), liveness()).prop_map(|((app, life, epoch), liveness)| {
+            CoordinatorToApp::Welcome {
+                app: AppId(app),
+                incarnation: AppIncarnation(life),
+                epoch: Epoch(epoch),
+                liveness,
+            }
+        }),
+        "\\PC{0,80}".prop_map(|reason| CoordinatorToApp::Refused { reason }),
+        plan,
+        (any::<u64>(), reason)
+            .prop_map(|(batch, reason)| CoordinatorToApp::Waiting { batch: BatchId(batch), reason }),
+        (any::<(u64, u32, u32)>(), failure()).prop_map(|((app, task, index), failure)| {
+            let job = JobId { app: AppId(app), task: TaskId(task), index: JobIndex(index) };
+            CoordinatorToApp::JobFailed { job, failure }
+        }),
+        any::<u64>().prop_map(|sequence| CoordinatorToApp::HeartbeatAck { sequence }),
+    ]
+}
+
+fn node_to_coordinator() -> impl Strategy<Value = NodeToCoordinator> {
+    let hello = (any::<(u32, u64)>(), "\\PC{0,40}", vec(device_info(), 0..5), contact(), attempts())
+        .prop_map(|((protocol, session), name, devices, contact, inventory)| {
+            let session = NodeSession(session);
+            NodeToCoordinator::Hello(NodeHello { protocol, name, session, devices, contact, inventory })
+        });
+    let load =
+        any::<(u32, u32)>().prop_map(|(queued_jobs, running_jobs)| DeviceLoad { queued_jobs, running_jobs });
+    let outcome = (any::<(u16, u64)>(), option::of(failure()));
+    let executed =
+        (attempts(), vec(outcome, 40)).prop_map(|(attempts, outcomes)| {
+            let executed =
+                attempts.into_iter().zip(outcomes).map(|(job, ((device, device_time_ns), failure))| {
+                    Executed { job, device: DeviceIndex(device), device_time_ns, failure }
+                });
+            executed.collect::<Vec<_>>()
+        });
+    prop_oneof![
+        hello,
+        (any::<(u64, u64)>(), vec(load, 0..9)).prop_map(|((sequence, spool_bytes), devices)| {
+            NodeToCoordinator::Heartbeat { sequence, devices, spool_bytes }
+        }),
+        (executed, attempts())
+            .prop_map(|(executed, delivered)| NodeToCoordinator::Report { executed, delivered }),
+        (any::<u16>(), "\\PC{0,80}").prop_map(|(device, reason)| NodeToCoordinator::DeviceLost {
+            device: DeviceIndex(device),
+            reason
+        }),
+        Just(NodeToCoordinator::Goodbye),
+    ]
+}
+
+fn coordinator_to_node() -> impl Strategy<Value = CoordinatorToNode> {
+    prop_oneof![
+        (any::<(u64, u32)>(), liveness()).prop_map(|((node, epoch), liveness)| CoordinatorToNode::Welcome {
+            node: NodeId(node),
+            epoch: Epoch(epoch),
+            liveness
+        }),
+        "\\PC{0,80}".prop_map(|reason| CoordinatorToNode::Refused { reason }),
+        (any::<u64>(), positive())
+            .prop_map(|(app, weight)| CoordinatorToNode::AppJoined { app: AppId(app), weight }),
+        any::<u64>().prop_map(|app| CoordinatorToNode::AppLeft { app: AppId(app) }),
+        attempts().prop_map(|jobs| CoordinatorToNode::Cancel { jobs }),
+        Just(CoordinatorToNode::Drain),
+        any::<u64>().prop_map(|sequence| CoordinatorToNode::HeartbeatAck { sequence }),
+    ]
+}
+
+fn farm_status() -> impl Strategy<Value = FarmStatus> {
+    let device = (any::<u16>(), "\\PC{0,20}", kind(), 0.0..f64::MAX, any::<([u64; 3], u32)>()).prop_map(
+        |(device, name, kind, score, (counts, running_jobs))| DeviceStatus {
+            device: DeviceIndex(device),
+            name,
+            kind,
+            score,
+            planned_jobs: counts[0],
+            running_jobs,
+            executed_jobs: counts[1],
+            device_time_ns: counts[2],
+        },
+    );
+    let state = prop::sample::select(vec![NodeState::Alive, NodeState::Suspect, NodeState::Draining]);
+    let node = (any::<u64>(), "\\PC{0,20}", state, vec("[a-z0-9.:]{1,30}", 0..3), vec(device, 0..4))
+        .prop_map(|(node, name, state, addresses, devices)| NodeStatus {
+            node: NodeId(node),
+            name,
+            state,
+            addresses,
+            devices,
+        });
+    let app = (any::<(u64, bool, [u64; 4])>(), "\\PC{0,20}", positive()).prop_map(
+        |((app, connected, counts), name, weight)| AppStatus {
+            app: AppId(app),
+            name,
+            weight,
+            connected,
+            waiting_jobs: counts[0],
+            outstanding_jobs: counts[1],
+            delivered_jobs: counts[2],
+            device_time_ns: counts[3],
+        },
+    );
+    (any::<(u32, u64, u64)>(), vec(node, 0..4), vec(app, 0..4)).prop_map(
+        |((epoch, delivered, replanned), nodes, apps)| FarmStatus {
+            epoch: Epoch(epoch),
+            nodes,
+            apps,
+            delivered_jobs: delivered,
+            replanned_jobs: replanned,
+        },
+    )
+}
+
+proptest! {
+    #[test]
+    fn app_to_coordinator_comes_back(message in app_to_coordinator()) {
+        prop_assert_eq!(over_the_wire::<_, v1::AppToCoordinator>(message.clone()), message);
+    }
+
+    #[test]
+    fn coordinator_to_app_comes_back(message in coordinator_to_app()) {
+        prop_assert_eq!(over_the_wire::<_, v1::CoordinatorToApp>(message.clone()), message);
+    }
+
+    #[test]
+    fn node_to_coordinator_comes_back(message in node_to_coordinator()) {
+        prop_assert_eq!(over_the_wire::<_, v1::NodeToCoordinator>(message.clone()), message);
+    }
+
+    #[test]
+    fn coordinator_to_node_comes_back(message in coordinator_to_node()) {
+        prop_assert_eq!(over_the_wire::<_, v1::CoordinatorToNode>(message.clone()), message);
+    }
+
+    #[test]
+    fn farm_status_comes_back(status in farm_status()) {
+        prop_assert_eq!(over_the_wire::<_, v1::FarmStatus>(status.clone()), status);
+    }
+
+    #[test]
+    fn any_bytes_give_an_answer(bytes in vec(any::<u8>(), 0..200)) {
+        // Whatever the answers are, there are some.
+        let _ = v1::AppToCoordinator::decode(&bytes[..]).map(AppToCoordinator::try_from);
+        let _ = v1::CoordinatorToApp::decode(&bytes[..]).map(CoordinatorToApp::try_from);
+        let _ = v1::NodeToCoordinator::decode(&bytes[..]).map(NodeToCoordinator::try_from);
+        let _ = v1::CoordinatorToNode::decode(&bytes[..]).map(CoordinatorToNode::try_from);
+        let _ = v1::FarmStatus::decode(&bytes[..]).map(FarmStatus::try_from);
+    }
+
+    #[test]
+    fn a_flipped_byte_never_panics(message in coordinator_to_app(), at in any::<prop::sample::Index>(), byte in any::<u8>()) {
+        let mut bytes = v1::CoordinatorToApp::from(message).encode_to_vec();
+        if !bytes.is_empty() {
+            let at = at.index(bytes.len());
+            bytes[at] = byte;
+        }
+        let _ = v1::CoordinatorToApp::decode(&bytes[..]).map(CoordinatorToApp::try_from);
+    }
+}
+
+fn field_of(error: &WireError) -> &'static str {
+    match error {
+        WireError::Missing { field }
+        | WireError::Invalid { field, .. }
+        | WireError::TooMany { field, .. } => field,
+    }
+}
+
+fn report(change: impl FnOnce(&mut v1::Report)) -> Result<NodeToCoordinator, WireError> {
+    let job = JobId { app: AppId(1), task: TaskId(1), index: JobIndex(1) };
+    let job = JobAttempt { job, attempt: Attempt { epoch: Epoch(1), sequence: 1 } };
+    let done =
+        Executed { job, device: DeviceIndex(0), device_time_ns: 5, failure: Some(JobFailure::Timeout) };
+    let wire =
+        v1::NodeToCoordinator::from(NodeToCoordinator::Report { executed: vec![done], delivered: vec![job] });
+    let Some(v1::node_to_coordinator::Message::Report(mut report)) = wire.message else {
+        panic!("another message")
+    };
+    change(&mut report);
+    v1::NodeToCoordinator { message: Some(v1::node_to_coordinator::Message::Report(report)) }.try_into()
+}
+
+#[test]
+fn what_is_not_allowed_is_refused_by_field() {
+    let hello = |weight: f64, name: &str| {
+        let hello = v1::AppHello { protocol: 1, name: name.to_owned(), weight, resume: None };
+        AppHello::try_from(hello).map(|_| ())
+    };
+    let plan = |index_deltas: Vec<i64>, cost_ns: Vec<u64>| {
+        let needs = Some(Requirements::ANY.into());
+        let request =
+            v1::PlanRequest { batch: 1, task: 1, index_deltas, cost_ns, needs, contents: Vec::new() };
+        PlanRequest::try_from(request).map(|_| ())
+    };
+    let run = |index_deltas: Vec<i64>, sequence_deltas: Vec<i64>| {
+        let run = v1::AttemptRun { app: 1, task: 1, epoch: 1, index_deltas, sequence_deltas };
+        Vec::<JobAttempt>::try_from(v1::Attempts { runs: vec![run] }).map(|_| ())
+    };
+    let message = AppToCoordinator::try_from(v1::AppToCoordinator { message: None }).map(|_| ());
+    let waiting = v1::coordinator_to_app::Message::Waiting(v1::Waiting { batch: 1, reason: 99 });
+    let waiting = CoordinatorToApp::try_from(v1::CoordinatorToApp { message: Some(waiting) }).map(|_| ());
+    let device = v1::DevicePlan { device: 65_536, jobs: Some(v1::Attempts::default()) };
+    let kind = v1::DeviceInfo { limits: Some(Limits::NONE.into()), ..v1::DeviceInfo::default() };
+    let hash = v1::Content { hash: vec![0; 31], size_bytes: 1 };
+    let failure = v1::ExecutedFailure { position: 0, failure: Some(JobFailure::Timeout.into()) };
+    let cases: Vec<(&str, Result<(), WireError>)> = vec![
+        ("AppToCoordinator.message", message),
+        ("AppHello.weight", hello(0.0, "a")),
+        ("AppHello.weight", hello(f64::NAN, "a")),
+        ("AppHello.weight", hello(f64::INFINITY, "a")),
+        ("AppHello.name", hello(1.0, &"a".repeat(257))),
+        ("PlanRequest.index_deltas", plan(vec![-1], vec![])),
+        ("PlanRequest.index_deltas", plan(vec![1, i64::MAX], vec![])),
+        ("PlanRequest.index_deltas", plan(vec![1 << 32], vec![])),
+        ("PlanRequest.index_deltas", plan(vec![0; (1 << 20) + 1], vec![])),
+        ("PlanRequest.cost_ns", plan(vec![1, 1, 1], vec![1, 2])),
+        ("AttemptRun.sequence_deltas", run(vec![1, 1], vec![1])),
+        ("AttemptRun.index_deltas", run(vec![i64::MIN], vec![1])),
+        ("Attempts.runs", run(vec![0; (1 << 20) + 1], vec![0; (1 << 20) + 1])),
+        ("Waiting.reason", waiting),
+        ("DevicePlan.device", DevicePlan::try_from(device).map(|_| ())),
+        ("DeviceInfo.kind", DeviceInfo::try_from(kind).map(|_| ())),
+        ("Content.hash", Content::try_from(hash).map(|_| ())),
+        ("Report.delivered", report(|report| report.delivered = None).map(|_| ())),
+        ("Report.executed_devices", report(|report| report.executed_devices.clear()).map(|_| ())),
+        (
+            "Report.executed_device_time_ns",
+            report(|report| report.executed_device_time_ns.push(1)).map(|_| ()),
+        ),
+        ("ExecutedFailure.position", report(|report| report.failures[0].position = 1).map(|_| ())),
+        ("ExecutedFailure.position", report(|report| report.failures.push(failure)).map(|_| ())),
+        ("ExecutedFailure.failure", report(|report| report.failures[0].failure = None).map(|_| ())),
+    ];
+    for (position, (field, outcome)) in cases.into_iter().enumerate() {
+        assert_eq!(field_of(&outcome.unwrap_err()), field, "case {position}");
+    }
+    // Negative controls: the same builders with allowed values.
+    assert_eq!(hello(1.0, "a"), Ok(()));
+    assert_eq!(plan(vec![5, -5], vec![1, 2]), Ok(()));
+    assert_eq!(run(vec![5, -5], vec![1, -1]), Ok(()));
+    assert!(report(|_| {}).is_ok(), "an unchanged report is allowed");
+}
+
+#[test]
+fn long_texts_for_people_are_cut_instead_of_refused() {
+    // A three-byte letter across the cut.
+    let reason = "€".repeat(MAX_TEXT_BYTES);
+    let message = CoordinatorToNode::Refused { reason: reason.clone() };
+    let CoordinatorToNode::Refused { reason: cut } = over_the_wire::<_, v1::CoordinatorToNode>(message)
+    else {
+        panic!("another message")
+    };
+    assert!(reason.starts_with(&cut), "the beginning is kept");
+    assert!(cut.len() > MAX_TEXT_BYTES - 3 && cut.len() <= MAX_TEXT_BYTES, "{} B", cut.len());
+}
+
+#[test]
+fn a_plan_of_4096_jobs_is_small() {
+    let jobs = (0..4_096).map(|index| JobAttempt {
+        job: JobId { app: AppId(17), task: TaskId(3), index: JobIndex(index) },
+        attempt: Attempt { epoch: Epoch(2), sequence: 1_000_000 + u64::from(index) },
+    });
+    let contact = Contact { addresses: vec!["10.0.0.1:40000".to_owned()], certificate_der: vec![0; 400] };
+    let node = NodePlan {
+        node: NodeId(1),
+        session: NodeSession(u64::MAX),
+        contact,
+        devices: vec![DevicePlan { device: DeviceIndex(0), jobs: jobs.collect() }],
+    };
+    let plan = CoordinatorToApp::Plan(Plan { batch: Some(BatchId(1)), nodes: vec![node] });
+    let bytes = v1::CoordinatorToApp::from(plan).encoded_len();
+    assert!(bytes < 9_000, "{bytes} B for 4,096 jobs");
+    let request = PlanRequest {
+        batch: BatchId(1),
+        task: TaskId(3),
+        jobs: (0..4_096).map(|index| PlanJob { index: JobIndex(index), cost: CostNs(1_000_000) }).collect(),
+        needs: Requirements::ANY_REAL,
+        contents: Vec::new(),
+    };
+    let bytes = v1::PlanRequest::from(request).encoded_len();
+    assert!(bytes < 4_200, "{bytes} B for 4,096 jobs");
+}
