@@ -8,6 +8,7 @@ use std::{
 
 use bytes::Bytes;
 use farm_core::{id::ContentHash, program::Content};
+use proto::codec::content_hash;
 
 /// The bytes of every live run's contents, shared between the runs that add to it and the data server that reads.
 ///
@@ -57,7 +58,7 @@ impl ContentStore {
 #[derive(Debug)]
 pub struct TaskData {
     store: ContentStore,
-    added: BTreeSet<ContentHash>,
+    added: BTreeSet<Content>,
 }
 
 impl TaskData {
@@ -77,14 +78,13 @@ impl TaskData {
     }
 
     /// What was added here.
-    pub(crate) fn added(&self) -> impl Iterator<Item = ContentHash> {
+    pub(crate) fn added(&self) -> impl Iterator<Item = Content> {
         self.added.iter().copied()
     }
 
     fn add(&mut self, bytes: Bytes) -> Content {
-        let content =
-            Content { hash: ContentHash(*blake3::hash(&bytes).as_bytes()), size_bytes: bytes.len() as u64 };
-        if self.added.insert(content.hash) {
+        let content = Content { hash: content_hash(&bytes), size_bytes: bytes.len() as u64 };
+        if self.added.insert(content) {
             self.store.retain(content.hash, bytes);
         }
         content
@@ -93,8 +93,8 @@ impl TaskData {
 
 impl Drop for TaskData {
     fn drop(&mut self) {
-        for hash in &self.added {
-            self.store.release(hash);
+        for content in &self.added {
+            self.store.release(&content.hash);
         }
     }
 }

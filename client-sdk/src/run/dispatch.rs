@@ -11,7 +11,7 @@ use std::{
 use bytes::Bytes;
 use farm_core::{
     device::{Limits, Requirements},
-    id::{ContentHash, JobIndex},
+    id::JobIndex,
     message::{CostNs, Priority},
     program::{Content, DispatchError, JobProgram, ProgramError, ProgramQuota, ProgramSummary, validate},
 };
@@ -73,7 +73,7 @@ impl DispatchFault {
 /// The offset in `jobs` of the first job (in order) that failed, and why.
 pub(super) fn dispatch_chunk(
     jobs: &mut [Box<dyn Job>],
-    known: &HashSet<ContentHash>,
+    known: &HashSet<Content>,
     time_each: Duration,
 ) -> Result<DispatchedChunk, (usize, DispatchFault)> {
     let started = Instant::now();
@@ -95,7 +95,7 @@ fn threads_for(jobs: usize, time_each: Duration) -> usize {
 
 fn dispatch_side_by_side(
     jobs: &mut [Box<dyn Job>],
-    known: &HashSet<ContentHash>,
+    known: &HashSet<Content>,
     threads: usize,
 ) -> Result<Vec<Dispatched>, (usize, DispatchFault)> {
     let part = jobs.len().div_ceil(threads);
@@ -116,7 +116,7 @@ fn dispatch_side_by_side(
 
 fn dispatch_in_order(
     jobs: &mut [Box<dyn Job>],
-    known: &HashSet<ContentHash>,
+    known: &HashSet<Content>,
 ) -> Result<Vec<Dispatched>, (usize, DispatchFault)> {
     let quota = ProgramQuota::default();
     let dispatch = |(at, job): (usize, &mut Box<dyn Job>)| {
@@ -127,7 +127,7 @@ fn dispatch_in_order(
 
 fn dispatch_one(
     job: &mut dyn Job,
-    known: &HashSet<ContentHash>,
+    known: &HashSet<Content>,
     quota: &ProgramQuota,
 ) -> Result<Dispatched, DispatchFault> {
     let mut program = JobProgram::default();
@@ -142,7 +142,7 @@ fn dispatch_one(
     let cost = if cost == CostNs(0) { summary.cost } else { cost };
     let mut contents = summary.allocations;
     contents.extend(summary.modules);
-    if let Some(content) = contents.iter().find(|content| !known.contains(&content.hash)) {
+    if let Some(content) = contents.iter().find(|content| !known.contains(content)) {
         return Err(DispatchFault::UnknownContent(*content));
     }
     let program = codec::encode_program(&program).map_err(DispatchFault::Encode)?;
@@ -197,6 +197,8 @@ pub(super) fn catch_panic<T>(code: impl FnOnce() -> T) -> Result<T, String> {
 
 #[cfg(test)]
 mod tests {
+    use farm_core::id::ContentHash;
+
     use super::*;
 
     /// Fails, panics or names an unknown content at chosen indices.

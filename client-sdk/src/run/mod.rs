@@ -17,9 +17,10 @@ use std::{
 use bytes::Bytes;
 use farm_core::{
     device::Requirements,
-    id::{ContentHash, JobId, JobIndex, NodeId, TaskId},
+    id::{JobId, JobIndex, NodeId, TaskId},
     ledger::SubmittedJob,
     message::{JobFailure, WaitReason},
+    program::Content,
 };
 use tokio::sync::{OwnedSemaphorePermit, watch};
 
@@ -164,7 +165,7 @@ struct Runner {
     window: WindowUse,
     /// What the run's tasks have added, kept until the run ends.
     data: Vec<TaskData>,
-    known: HashSet<ContentHash>,
+    known: HashSet<Content>,
     store: ContentStore,
     driver: DriverHandle,
     progress: watch::Sender<Progress>,

@@ -6,8 +6,8 @@ use std::{
 };
 
 use farm_core::{
-    id::AppId,
-    program::{Content, DispatchError, JobProgram},
+    id::{AppId, ContentHash},
+    program::{DispatchError, JobProgram},
 };
 use tokio::sync::mpsc as tokio_mpsc;
 
