@@ -189,3 +189,33 @@ fn coordinator_from_arguments() -> Option<String> {
         _ => None,
     }
 }
+
+/// A job is tested without a farm: its methods are plain methods.
+#[cfg(test)]
+mod tests {
+    use client_sdk::{Bytes, ContentHash, NodeId};
+    use farm_core::program::{ProgramQuota, validate};
+
+    use super::*;
+
+    #[test]
+    fn programs_are_valid_and_results_land_in_their_place() {
+        let content = |number, size_bytes| Content { hash: ContentHash([number; 32]), size_bytes };
+        let shared = Shared { module: content(1, ADD.len() as u64), a: content(2, JOBS as u64 * JOB_BYTES) };
+        let sum = Arc::new(Mutex::new(vec![f32::NAN; JOBS * JOB_FLOATS]));
+        for number in 0..JOBS {
+            let mut job = AddPart { number, b: vec![1.0; JOB_FLOATS], shared, sum: Arc::clone(&sum) };
+            let mut program = JobProgram::default();
+            job.dispatch(&mut program).unwrap();
+            let summary = validate(&program, &ProgramQuota::default()).unwrap();
+            assert_eq!(summary.sections, [JOB_BYTES]);
+
+            let found: Vec<f32> = (0_u16..4_096).map(|at| f32::from(at) + 0.5).collect();
+            let sections = vec![Bytes::from(to_bytes(&found))];
+            let result = JobResult { sections, device_time: std::time::Duration::ZERO, node: NodeId(1) };
+            job.retrieve(result).unwrap();
+            assert_eq!(sum.lock().unwrap()[number * JOB_FLOATS..][..JOB_FLOATS], found);
+        }
+        assert!(!sum.lock().unwrap().iter().any(|sum| sum.is_nan()), "every place is filled");
+    }
+}
