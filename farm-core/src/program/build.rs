@@ -1,9 +1,14 @@
 //! The verbs that an application's `dispatch()` uses to fill a program. Each checks what it can see; `validate` checks
 //! the whole, also of programs that came over a wire.
 
+use std::collections::BTreeMap;
+
 use thiserror::Error;
 
-use super::{Access, Buffer, Command, Content, JobProgram, Kernel, Slicing};
+use super::{
+    Access, Buffer, Command, Content, JobProgram, Kernel, Slicing,
+    validate::{MAX_GLOBAL_BYTES, PARAM_ALIGNMENT_BYTES},
+};
 use crate::message::CostNs;
 
 /// A verb refused its arguments. Not to be retried: the application is wrong.
@@ -16,6 +21,24 @@ pub enum DispatchError {
         verb: &'static str,
         /// The size given.
         size_bytes: u64,
+    },
+    /// A global's value is too large for a uniform.
+    #[error("{verb}: {size_bytes} B are more than the {MAX_GLOBAL_BYTES} B of a uniform")]
+    GlobalSize {
+        /// The verb.
+        verb: &'static str,
+        /// The size given.
+        size_bytes: u64,
+    },
+    /// An offset is not aligned.
+    #[error("{verb}: offset {offset_bytes} B must be a multiple of {alignment_bytes}")]
+    Offset {
+        /// The verb.
+        verb: &'static str,
+        /// The offset given.
+        offset_bytes: u64,
+        /// What it must be a multiple of.
+        alignment_bytes: u64,
     },
     /// A handle does not belong to this program.
     #[error("{verb}: {what} {handle} is not of this program")]
@@ -69,22 +92,21 @@ impl JobProgram {
         if size_bytes == 0 || !size_bytes.is_multiple_of(4) {
             return Err(DispatchError::Size { verb: "malloc", size_bytes });
         }
-        let buffer = self.new_buffer();
+        let buffer = self.new_buffer(size_bytes, Access::InOut);
         self.commands.push(Command::Malloc { buffer, size_bytes });
         Ok(buffer)
     }
 
     /// Binds a task allocation; the same content gives the same handle.
     pub fn task_allocation(&mut self, content: Content) -> Buffer {
-        let known = self.commands.iter().find_map(|command| match command {
-            Command::TaskAllocation { buffer, content: bound } if *bound == content => Some(*buffer),
-            _ => None,
-        });
-        known.unwrap_or_else(|| {
-            let buffer = self.new_buffer();
-            self.commands.push(Command::TaskAllocation { buffer, content });
-            buffer
-        })
+        self.refresh_definitions();
+        if let Some(&known) = self.definitions.allocations.get(&content) {
+            return known;
+        }
+        let buffer = self.new_buffer(content.size_bytes, Access::In);
+        self.definitions.allocations.insert(content, buffer);
+        self.commands.push(Command::TaskAllocation { buffer, content });
+        buffer
     }
 
     /// An entry point of a module.
@@ -109,9 +131,17 @@ impl JobProgram {
     /// Host bytes into a kernel's named global (thesis listing B.2: `clMemcpyHtoD` on a module global).
     ///
     /// # Errors
-    /// The kernel is not of this program.
+    /// The kernel is not of this program, or the size is zero, not a multiple of 4, or larger than a uniform.
     pub fn memcpy_htod(&mut self, kernel: Kernel, global: &str, bytes: &[u8]) -> Result<(), DispatchError> {
-        self.check_kernel("memcpy_htod", kernel)?;
+        const VERB: &str = "memcpy_htod";
+        let size_bytes = bytes.len() as u64;
+        self.check_kernel(VERB, kernel)?;
+        if size_bytes == 0 || !size_bytes.is_multiple_of(4) {
+            return Err(DispatchError::Size { verb: VERB, size_bytes });
+        }
+        if size_bytes > MAX_GLOBAL_BYTES {
+            return Err(DispatchError::GlobalSize { verb: VERB, size_bytes });
+        }
         self.commands.push(Command::GlobalHtoD { kernel, name: global.to_owned(), bytes: bytes.to_vec() });
         Ok(())
     }
@@ -129,6 +159,7 @@ impl JobProgram {
         const VERB: &str = "memcpy_htod_buffer";
         self.check_writable(VERB, buffer)?;
         self.check_range(VERB, buffer, offset_bytes, bytes.len() as u64)?;
+        check_offset(VERB, offset_bytes, 4)?;
         self.commands.push(Command::MemcpyHtoD { buffer, offset_bytes, bytes: bytes.to_vec() });
         Ok(())
     }
@@ -155,7 +186,8 @@ impl JobProgram {
     /// Binds a part of a buffer: large arrays are split over bindings where a device's binding limit asks for it.
     ///
     /// # Errors
-    /// A handle is not of this program, or the range leaves the buffer.
+    /// A handle is not of this program, the range leaves the buffer, the offset is not a multiple of 256, or a task
+    /// allocation is to be written.
     pub fn param(
         &mut self,
         kernel: Kernel,
@@ -167,6 +199,11 @@ impl JobProgram {
     ) -> Result<(), DispatchError> {
         self.check_kernel("param", kernel)?;
         self.check_range("param", buffer, offset_bytes, size_bytes)?;
+        check_offset("param", offset_bytes, PARAM_ALIGNMENT_BYTES)?;
+        match access {
+            Access::In => {}
+            Access::InOut => self.check_writable("param", buffer)?,
+        }
         self.commands.push(Command::Param { kernel, index, buffer, offset_bytes, size_bytes, access });
         Ok(())
     }
@@ -219,12 +256,15 @@ impl JobProgram {
         const VERB: &str = "memcpy_dtoh";
         self.check_writable(VERB, buffer)?;
         self.check_range(VERB, buffer, offset_bytes, size_bytes)?;
+        check_offset(VERB, offset_bytes, 4)?;
         self.commands.push(Command::MemcpyDtoH { buffer, offset_bytes, size_bytes });
         Ok(())
     }
 
-    fn new_buffer(&mut self) -> Buffer {
+    fn new_buffer(&mut self, size_bytes: u64, access: Access) -> Buffer {
+        self.refresh_definitions();
         self.buffers += 1;
+        self.definitions.buffers.push((size_bytes, access));
         Buffer(self.buffers - 1)
     }
 
@@ -250,7 +290,7 @@ impl JobProgram {
         Err(DispatchError::UnknownHandle { verb, what: "kernel", handle: kernel.0 })
     }
 
-    fn buffer_bytes(&self, verb: &'static str, buffer: Buffer) -> Result<u64, DispatchError> {
+    fn buffer_bytes(&mut self, verb: &'static str, buffer: Buffer) -> Result<u64, DispatchError> {
         self.definition(buffer).map(|(size_bytes, _)| size_bytes).ok_or(DispatchError::UnknownHandle {
             verb,
             what: "buffer",
@@ -258,7 +298,7 @@ impl JobProgram {
         })
     }
 
-    fn check_writable(&self, verb: &'static str, buffer: Buffer) -> Result<(), DispatchError> {
+    fn check_writable(&mut self, verb: &'static str, buffer: Buffer) -> Result<(), DispatchError> {
         match self.definition(buffer) {
             None => Err(DispatchError::UnknownHandle { verb, what: "buffer", handle: buffer.0 }),
             Some((_, Access::In)) => Err(DispatchError::ReadOnly { verb, buffer: buffer.0 }),
@@ -267,7 +307,7 @@ impl JobProgram {
     }
 
     fn check_range(
-        &self,
+        &mut self,
         verb: &'static str,
         buffer: Buffer,
         offset_bytes: u64,
@@ -290,15 +330,56 @@ impl JobProgram {
     }
 
     /// Size of a buffer, and whether it may be written.
-    fn definition(&self, wanted: Buffer) -> Option<(u64, Access)> {
-        self.commands.iter().find_map(|command| match command {
-            Command::Malloc { buffer, size_bytes } if *buffer == wanted => Some((*size_bytes, Access::InOut)),
-            Command::TaskAllocation { buffer, content } if *buffer == wanted => {
-                Some((content.size_bytes, Access::In))
-            }
-            _ => None,
-        })
+    fn definition(&mut self, wanted: Buffer) -> Option<(u64, Access)> {
+        self.refresh_definitions();
+        self.definitions.buffers.get(usize::try_from(wanted.0).ok()?).copied()
     }
+
+    /// A program that came over a wire brings its commands only.
+    fn refresh_definitions(&mut self) {
+        if self.buffers == 0 || !self.definitions.buffers.is_empty() {
+            return;
+        }
+        for command in &self.commands {
+            match command {
+                Command::Malloc { size_bytes, .. } => {
+                    self.definitions.buffers.push((*size_bytes, Access::InOut))
+                }
+                Command::TaskAllocation { buffer, content } => {
+                    self.definitions.buffers.push((content.size_bytes, Access::In));
+                    self.definitions.allocations.insert(*content, *buffer);
+                }
+                Command::Function { .. }
+                | Command::MemcpyHtoD { .. }
+                | Command::GlobalHtoD { .. }
+                | Command::Param { .. }
+                | Command::Launch { .. }
+                | Command::MemcpyDtoH { .. } => {}
+            }
+        }
+    }
+}
+
+/// The buffers of a program under construction: what each verb would otherwise search the commands for.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Definitions {
+    /// Size and use, by handle.
+    buffers: Vec<(u64, Access)>,
+    allocations: BTreeMap<Content, Buffer>,
+}
+
+/// Two programs of the same commands are the same, whether they were built here or came over a wire.
+impl PartialEq for Definitions {
+    fn eq(&self, _: &Self) -> bool {
+        true
+    }
+}
+
+fn check_offset(verb: &'static str, offset_bytes: u64, alignment_bytes: u64) -> Result<(), DispatchError> {
+    if offset_bytes.is_multiple_of(alignment_bytes) {
+        return Ok(());
+    }
+    Err(DispatchError::Offset { verb, offset_bytes, alignment_bytes })
 }
 
 /// Bytes as one serde value instead of a sequence of numbers: one copy, not one call per byte.

@@ -144,6 +144,9 @@ pub struct JobProgram {
     commands: Vec<Command>,
     buffers: u32,
     kernels: u32,
+    /// What the verbs look up; follows from `commands`.
+    #[serde(skip)]
+    definitions: build::Definitions,
 }
 
 impl JobProgram {
