@@ -309,3 +309,115 @@ impl Job for RenderLight {
         self.shared.film().add_splats(self.turn, layer).map_err(RetrieveError::application)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use glam::Vec3;
+
+    use super::*;
+    use crate::{
+        gpu::{Counters, FirstHit, PixelSum, SplatLayer, TileLayer},
+        scene::model::Camera,
+    };
+
+    fn scene() -> Scene {
+        let camera = Camera { eye: Vec3::Z, target: Vec3::ZERO, up: Vec3::Y, hfov_deg: 40.0 };
+        let film = FilmSize::new(64, 48).unwrap();
+        Scene { film, camera, triangles: Vec::new(), materials: Vec::new(), environment: Some(Vec3::ONE) }
+    }
+
+    fn render_task(width: u32, height: u32, spp: u32) -> RenderTask {
+        let plan = RenderPlan::new(FilmSize::new(width, height).unwrap(), spp, 1, LightImage::Traced);
+        let shared = Arc::new(Shared { plan, film: Mutex::new(Film::new(plan)), prepared: OnceLock::new() });
+        RenderTask { cursor: Cursor::new(plan), shared }
+    }
+
+    fn tile_layer(job: &TileJob) -> TileLayer {
+        let pixels = (job.width_px * job.height_px) as usize;
+        TileLayer {
+            x_px: job.x_px,
+            y_px: job.y_px,
+            width_px: job.width_px,
+            height_px: job.height_px,
+            pixels: vec![PixelSum { count: job.samples, ..PixelSum::default() }; pixels],
+            first_hits: vec![FirstHit::default(); pixels],
+            counters: Counters::default(),
+        }
+    }
+
+    #[test]
+    fn requests_out_of_range_are_refused() {
+        let size = FilmSize { width_px: 64, height_px: 64 };
+        for spp in [0, MAX_SAMPLES_PER_PIXEL + 1] {
+            let error = render_graph(scene(), RenderOptions::new(size, spp, 1)).unwrap_err();
+            assert_eq!(error, RenderError::Samples { spp });
+        }
+        for size in [FilmSize { width_px: 0, height_px: 64 }, FilmSize { width_px: 16_000, height_px: 16_000 }] {
+            let error = render_graph(scene(), RenderOptions::new(size, 1, 1)).unwrap_err();
+            assert!(matches!(error, RenderError::Frame(FrameError::Size { .. })), "{error}");
+        }
+    }
+
+    #[test]
+    fn a_render_is_two_tasks_and_an_empty_film() {
+        let size = FilmSize::new(200, 100).unwrap();
+        let (graph, handle) = render_graph(scene(), RenderOptions::new(size, 8, 1)).unwrap();
+        assert!(format!("{graph:?}").contains("(\"render\", \"bvh\")"), "{graph:?}");
+        let progress = handle.progress();
+        assert_eq!((progress.samples, progress.total_samples, progress.total_light_paths), (0, 160_000, 160_000));
+        assert_eq!(handle.bvh(), None);
+        assert!(handle.image().beauty.iter().all(|pixel| *pixel == [0.0; 3]), "nothing is black, not NaN");
+        let options = gpu::RenderOptions { integrator: Integrator::PathTracing, ..gpu::RenderOptions::default() };
+        let options = RenderOptions { integrator: options, ..RenderOptions::new(size, 8, 1) };
+        let (_, handle) = render_graph(scene(), options).unwrap();
+        assert_eq!(handle.plan().light_jobs(), 0);
+    }
+
+    #[test]
+    fn jobs_come_in_a_window_that_the_film_can_hold_in_any_order() {
+        // One tile of 1,600 slices: the worst case for a film, as every job waits for the one before.
+        let mut task = render_task(8, 8, 256 * 1_600);
+        let plan = task.shared.plan;
+        assert_eq!((plan.tiles(), plan.slices()), (1, 1_600));
+        let (mut tile, mut light) = (0, 0);
+        let mut rounds = 0;
+        loop {
+            let jobs = task.next_jobs().len();
+            if jobs == 0 {
+                break;
+            }
+            rounds += 1;
+            assert!(jobs <= MAX_HELD_TILES + 16, "{jobs} jobs at once");
+            // The newest results come first.
+            for number in (tile..task.cursor.tiles_out()).rev() {
+                let (turn, job) = plan.tile_job(number);
+                task.shared.film().add_tile(turn, tile_layer(&job)).expect("the window is what the film holds");
+            }
+            for number in (light..task.cursor.lights_out()).rev() {
+                let paths = plan.light_job(number).paths;
+                let (rgb, counters) = (vec![[0.0; 3]; 64], Counters::default());
+                let layer = SplatLayer { width_px: 8, height_px: 8, rgb, paths, counters };
+                task.shared.film().add_splats(number, layer).expect("the window is what the film holds");
+            }
+            (tile, light) = (task.cursor.tiles_out(), task.cursor.lights_out());
+        }
+        assert!(rounds > 3, "1,600 jobs do not fit into {rounds} windows");
+        task.finish().expect("every job was made and merged");
+    }
+
+    #[test]
+    fn an_image_that_is_not_complete_is_no_success() {
+        let mut task = render_task(64, 64, 4);
+        let error = task.finish().unwrap_err().to_string();
+        assert!(error.contains("0 of 16384 samples"), "{error}");
+    }
+
+    #[test]
+    fn a_job_before_its_scene_is_an_error() {
+        let mut task = render_task(64, 64, 4);
+        for mut job in task.next_jobs() {
+            let error = job.dispatch(&mut JobProgram::default()).unwrap_err();
+            assert!(error.to_string().contains("must run after"), "{error}");
+        }
+    }
+}

@@ -4,6 +4,7 @@
 
 pub mod bvh;
 pub mod film;
+pub mod generate;
 pub mod gpu;
 #[cfg(feature = "farm")]
 pub mod job;

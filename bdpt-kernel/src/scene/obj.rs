@@ -4,6 +4,8 @@
 //! the names of unknown materials, reads `usemtl<TAB>x` as nameless, and takes NaN for a number. Memory grows with
 //! the file's length only, never with a number written in it.
 
+use std::collections::HashMap;
+
 use glam::{DVec3, Vec3};
 
 use super::{
@@ -103,6 +105,7 @@ struct Scan<'a> {
     /// Index in `materials` of `current`, once a face has used it.
     current_index: Option<u32>,
     materials: Vec<UsedMaterial>,
+    material_indices: HashMap<Option<&'a str>, u32>,
     libraries: Vec<(String, usize)>,
     unknown: Option<(usize, String, usize)>,
 }
@@ -124,6 +127,7 @@ impl<'a> Scan<'a> {
             current: None,
             current_index: None,
             materials: Vec::new(),
+            material_indices: HashMap::new(),
             libraries: Vec::new(),
             unknown: None,
         }
@@ -290,14 +294,14 @@ impl<'a> Scan<'a> {
             return index;
         }
         let name = self.current.map(|(name, _)| name);
-        let known = self.materials.iter().position(|used| used.name.as_deref() == name);
-        let index = known.unwrap_or_else(|| {
+        let index = self.material_indices.get(&name).copied().unwrap_or_else(|| {
             let line = self.current.map_or(self.line, |(_, line)| line);
             let object = self.object.map(ToOwned::to_owned);
+            let index = u32::try_from(self.materials.len()).expect("fewer materials than lines, of which 2^32 do not fit");
             self.materials.push(UsedMaterial { name: name.map(ToOwned::to_owned), line, object });
-            self.materials.len() - 1
+            self.material_indices.insert(name, index);
+            index
         });
-        let index = u32::try_from(index).expect("fewer materials than lines, fewer lines than 2^32");
         self.current_index = Some(index);
         index
     }
