@@ -3,10 +3,38 @@
 //!
 //! One task owns the machine; everything else sends it messages. It never decides who runs what: the machine does.
 
-use std::{net::SocketAddr, path::PathBuf};
+mod owner;
+mod sessions;
+mod store;
+mod web;
 
-use farm_core::{coordinator::FarmStatus, message::Liveness};
+use std::{
+    hash::{BuildHasher as _, Hasher as _, RandomState},
+    net::SocketAddr,
+    path::PathBuf,
+    time::Duration,
+};
+
+use farm_core::{
+    coordinator::{CoordinatorConfig, CoordinatorMachine, FarmStatus},
+    id::NodeId,
+    message::Liveness,
+};
 use thiserror::Error;
+use tokio::{
+    net::TcpListener,
+    sync::{oneshot, watch},
+    task::JoinHandle,
+};
+
+use self::{
+    owner::{Owner, OwnerHandle},
+    sessions::Sessions,
+    store::{ControlStore, FileStore, MemoryStore},
+};
+
+/// How long `shutdown` waits for connections to close by themselves before it cuts them.
+const SHUTDOWN_TIMEOUT: Duration = Duration::from_secs(2);
 
 /// What a coordinator is started with.
 #[derive(Clone, Debug)]
@@ -72,29 +100,57 @@ pub enum StartError {
 
 /// A running coordinator. Dropping it stops it without waiting.
 #[derive(Debug)]
-pub struct CoordinatorHandle {}
+pub struct CoordinatorHandle {
+    owner: OwnerHandle,
+    grpc_addr: SocketAddr,
+    http_addr: SocketAddr,
+    /// Dropped: the owner ends every session and stops.
+    stop_owner: oneshot::Sender<()>,
+    /// Dropped: the listeners take nothing new and end when their connections do.
+    stop_servers: watch::Sender<()>,
+    /// Owner, gRPC server, HTTP server.
+    tasks: [JoinHandle<()>; 3],
+}
 
 impl CoordinatorHandle {
     /// Where applications and nodes connect.
     #[must_use]
-    pub fn grpc_addr(&self) -> SocketAddr {
-        unimplemented!()
+    pub const fn grpc_addr(&self) -> SocketAddr {
+        self.grpc_addr
     }
 
     /// Where the status page is.
     #[must_use]
-    pub fn http_addr(&self) -> SocketAddr {
-        unimplemented!()
+    pub const fn http_addr(&self) -> SocketAddr {
+        self.http_addr
     }
 
     /// The farm as an operator sees it; `None` once it has stopped.
     pub async fn status(&self) -> Option<FarmStatus> {
-        unimplemented!()
+        self.owner.status().await
     }
 
-    /// Closes every session and waits until all is down.
+    /// Asks a node to finish what it has and leave. Whether there is such a node; `None` once it has stopped.
+    pub async fn drain(&self, node: NodeId) -> Option<bool> {
+        self.owner.drain(node).await
+    }
+
+    /// Waits until the coordinator has stopped by itself: a broken invariant, never a peer's fault. Cancel-safe.
+    pub async fn stopped(&self) {
+        self.owner.stopped().await;
+    }
+
+    /// Closes every session and waits (at most two seconds) until all is down.
     pub async fn shutdown(self) {
-        unimplemented!()
+        let Self { stop_owner, stop_servers, tasks, .. } = self;
+        drop(stop_owner);
+        drop(stop_servers);
+        for mut task in tasks {
+            // A connection that does not close in time is cut; a task that failed has said so.
+            if tokio::time::timeout(SHUTDOWN_TIMEOUT, &mut task).await.is_err() {
+                task.abort();
+            }
+        }
     }
 }
 
@@ -103,6 +159,65 @@ impl CoordinatorHandle {
 /// # Errors
 /// An address or the state directory cannot be had.
 pub async fn start(options: CoordinatorOptions) -> Result<CoordinatorHandle, StartError> {
-    let _ = options;
-    unimplemented!()
+    let (grpc, grpc_addr) = listen("gRPC", options.listen).await?;
+    let (http, http_addr) = listen("HTTP", options.http).await?;
+    // After the addresses: a second coordinator on them is refused without counting as a life.
+    let mut store: Box<dyn ControlStore + Send> = match &options.state {
+        Some(directory) => Box::new(FileStore::open(directory)?),
+        None => Box::new(MemoryStore),
+    };
+    let epoch = store.begin_epoch()?;
+    let config = CoordinatorConfig {
+        liveness: options.liveness,
+        app_lease_ms: options.app_lease_ms,
+        ..CoordinatorConfig::new(epoch, random_seed())
+    };
+
+    let (owner, commands) = OwnerHandle::new();
+    let (stop_owner, owner_stops) = oneshot::channel();
+    let (stop_servers, servers_stop) = watch::channel(());
+    let owner_task = tokio::spawn(Owner::new(CoordinatorMachine::new(config)).run(commands, owner_stops));
+    let grpc_task = tokio::spawn(serve_grpc(grpc, Sessions::new(owner.clone()), servers_stop.clone()));
+    let http_task = tokio::spawn(serve_http(http, owner.clone(), servers_stop));
+    tracing::info!(%epoch, grpc = %grpc_addr, http = %http_addr, "coordinator started");
+    let tasks = [owner_task, grpc_task, http_task];
+    Ok(CoordinatorHandle { owner, grpc_addr, http_addr, stop_owner, stop_servers, tasks })
+}
+
+async fn listen(what: &'static str, address: SocketAddr) -> Result<(TcpListener, SocketAddr), StartError> {
+    let fault = |source| StartError::Listen { what, address, source };
+    let listener = TcpListener::bind(address).await.map_err(fault)?;
+    let local = listener.local_addr().map_err(fault)?;
+    Ok((listener, local))
+}
+
+async fn serve_grpc(listener: TcpListener, sessions: Sessions, mut stop: watch::Receiver<()>) {
+    use proto::control::{admin_server, apps_server, incoming, nodes_server, server};
+    let served = server()
+        .add_service(apps_server(sessions.clone()))
+        .add_service(nodes_server(sessions.clone()))
+        .add_service(admin_server(sessions))
+        .serve_with_incoming_shutdown(incoming(listener), async move {
+            // The error is the signal: the handle is gone.
+            let _ = stop.changed().await;
+        })
+        .await;
+    if let Err(error) = served {
+        tracing::error!(%error, "the gRPC server ended");
+    }
+}
+
+async fn serve_http(listener: TcpListener, owner: OwnerHandle, mut stop: watch::Receiver<()>) {
+    let served = axum::serve(listener, web::router(owner)).with_graceful_shutdown(async move {
+        // The error is the signal: the handle is gone.
+        let _ = stop.changed().await;
+    });
+    if let Err(error) = served.await {
+        tracing::error!(%error, "the HTTP server ended");
+    }
+}
+
+/// A seed that differs from life to life: the standard library's hasher keys come from the system.
+fn random_seed() -> u64 {
+    RandomState::new().build_hasher().finish()
 }

@@ -1,3 +1,78 @@
 //! The binary `farm-coordinator`.
 
-fn main() {}
+mod settings;
+
+use std::{io::Write as _, process::ExitCode};
+
+use anyhow::Context as _;
+use clap::Parser as _;
+use coordinator::CoordinatorOptions;
+use tokio::signal::unix::{Signal, SignalKind, signal};
+use tracing_subscriber::EnvFilter;
+
+use self::settings::Arguments;
+
+/// Something failed.
+const EXIT_FAILED: u8 = 1;
+/// The command line or the settings are wrong.
+const EXIT_USAGE: u8 = 2;
+
+fn main() -> ExitCode {
+    // clap exits with 2 by itself.
+    let arguments = Arguments::parse();
+    let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new("info"));
+    tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).init();
+    let options = match settings::options(arguments) {
+        Ok(options) => options,
+        Err(error) => return failed(EXIT_USAGE, &error),
+    };
+    match run(options) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => failed(EXIT_FAILED, &error),
+    }
+}
+
+fn failed(code: u8, error: &anyhow::Error) -> ExitCode {
+    eprintln!("farm-coordinator: {error:#}");
+    ExitCode::from(code)
+}
+
+#[tokio::main]
+async fn run(options: CoordinatorOptions) -> anyhow::Result<()> {
+    // Before anything is started: a signal during the start is not lost.
+    let mut interrupt = signal(SignalKind::interrupt()).context("cannot listen for SIGINT")?;
+    let mut terminate = signal(SignalKind::terminate()).context("cannot listen for SIGTERM")?;
+    for address in [options.listen, options.http] {
+        if !address.ip().is_loopback() {
+            tracing::warn!(
+                %address,
+                "listening beyond this machine WITHOUT authentication or encryption: whoever reaches this address can use \
+                 and disturb the farm; do so only on a network you trust"
+            );
+        }
+    }
+    let handle = coordinator::start(options).await?;
+    let ready = serde_json::json!({
+        "event": "ready",
+        "grpc": handle.grpc_addr().to_string(),
+        "http": handle.http_addr().to_string(),
+    });
+    writeln!(std::io::stdout(), "{ready}").context("cannot write the ready line to stdout")?;
+
+    tokio::select! {
+        () = asked_to_end(&mut interrupt, &mut terminate) => {}
+        () = handle.stopped() => anyhow::bail!("the coordinator stopped by itself; the log says why"),
+    }
+    tracing::info!("ending; a second signal ends at once");
+    tokio::select! {
+        () = handle.shutdown() => Ok(()),
+        () = asked_to_end(&mut interrupt, &mut terminate) => anyhow::bail!("ended before every session was closed"),
+    }
+}
+
+async fn asked_to_end(interrupt: &mut Signal, terminate: &mut Signal) {
+    tokio::select! {
+        _ = interrupt.recv() => {}
+        _ = terminate.recv() => {}
+    }
+}

@@ -1,0 +1,276 @@
+//! The one task that owns the machine: takes commands in bursts, feeds the machine, carries its effects out.
+//!
+//! It never waits for a peer: a peer whose queue is full does not read, and loses its connection.
+
+use std::{collections::HashMap, time::Duration};
+
+use farm_core::{
+    coordinator::{CoordinatorMachine, Effect, Event, FarmStatus},
+    id::{LinkId, NodeId},
+    message::{AppToCoordinator, CoordinatorToApp, CoordinatorToNode, NodeToCoordinator},
+    time::Instant,
+};
+use tokio::{
+    sync::{mpsc, oneshot},
+    time,
+};
+use tonic::Status;
+
+/// Commands that wait for the owner; a full queue holds the peers' messages back in their connections.
+pub(crate) const QUEUED_COMMANDS: usize = 1_024;
+/// Messages that wait to be sent to one peer; a peer that lets this many gather is closed.
+pub(crate) const QUEUED_MESSAGES: usize = 1_024;
+/// Commands taken at once.
+const BURST_COMMANDS: usize = 256;
+
+/// What the owner is asked to do.
+pub(crate) enum Command {
+    /// A connection of an application was opened.
+    AppOpened(LinkId, Peer<CoordinatorToApp>),
+    /// A connection of a node was opened.
+    NodeOpened(LinkId, Peer<CoordinatorToNode>),
+    /// An application said something.
+    FromApp(LinkId, AppToCoordinator),
+    /// A node said something.
+    FromNode(LinkId, NodeToCoordinator),
+    /// A connection is gone.
+    Closed(LinkId),
+    /// Asks how the farm stands.
+    Status(oneshot::Sender<FarmStatus>),
+    /// Asks a node to leave; answered with whether there is such a node.
+    Drain(NodeId, oneshot::Sender<bool>),
+}
+
+/// The owner's end of one connection. Dropping it ends the session after what is queued.
+pub(crate) struct Peer<M> {
+    /// To the peer.
+    pub(crate) outbound: mpsc::Sender<Result<M, Status>>,
+    /// Tells the session's reader to stop; dropped with the peer.
+    pub(crate) _alive: oneshot::Sender<()>,
+}
+
+impl<M> Peer<M> {
+    /// False if the peer does not read or is gone.
+    fn tell(&self, message: M) -> bool {
+        self.outbound.try_send(Ok(message)).is_ok()
+    }
+}
+
+/// Owns the machine until every handle of the command queue is dropped.
+pub(crate) struct Owner {
+    machine: CoordinatorMachine,
+    /// The machine's time zero.
+    origin: time::Instant,
+    apps: HashMap<LinkId, Peer<CoordinatorToApp>>,
+    nodes: HashMap<LinkId, Peer<CoordinatorToNode>>,
+}
+
+impl Owner {
+    pub(crate) fn new(machine: CoordinatorMachine) -> Self {
+        Self { machine, origin: time::Instant::now(), apps: HashMap::new(), nodes: HashMap::new() }
+    }
+
+    /// Runs until `stop` is told or dropped.
+    pub(crate) async fn run(
+        mut self,
+        mut commands: mpsc::Receiver<Command>,
+        mut stop: oneshot::Receiver<()>,
+    ) {
+        let mut burst = Vec::with_capacity(BURST_COMMANDS);
+        loop {
+            let wake = self.machine.poll_timeout().map(|at| self.origin + Duration::from_nanos(at.0));
+            tokio::select! {
+                taken = commands.recv_many(&mut burst, BURST_COMMANDS) => {
+                    if taken == 0 {
+                        return;
+                    }
+                }
+                () = time::sleep_until(wake.unwrap_or(self.origin)), if wake.is_some() => {}
+                _ = &mut stop => return,
+            }
+            let now = Instant::ZERO.after(self.origin.elapsed());
+            for command in burst.drain(..) {
+                self.take(now, command);
+            }
+            if self.machine.poll_timeout().is_some_and(|at| at <= now) {
+                self.machine.handle_timeout(now);
+            }
+            self.carry_out(now);
+        }
+    }
+
+    fn take(&mut self, now: Instant, command: Command) {
+        match command {
+            Command::AppOpened(link, peer) => {
+                self.apps.insert(link, peer);
+            }
+            Command::NodeOpened(link, peer) => {
+                self.nodes.insert(link, peer);
+            }
+            // What a peer said before its connection was closed here has no one to answer to.
+            Command::FromApp(link, message) => {
+                if self.apps.contains_key(&link) {
+                    self.machine.handle(now, Event::FromApp { link, message });
+                }
+            }
+            Command::FromNode(link, message) => {
+                if self.nodes.contains_key(&link) {
+                    self.machine.handle(now, Event::FromNode { link, message });
+                }
+            }
+            Command::Closed(link) => {
+                if self.forget(link) {
+                    self.machine.handle(now, Event::LinkClosed { link });
+                }
+            }
+            // An asker that went away needs no answer.
+            Command::Status(answer) => drop(answer.send(self.machine.status())),
+            Command::Drain(node, answer) => {
+                let known = self.machine.status().nodes.iter().any(|known| known.node == node);
+                if known {
+                    self.machine.handle(now, Event::DrainRequested { node });
+                }
+                let _ = answer.send(known);
+            }
+        }
+    }
+
+    /// Carries out every effect, those of the connections that broke meanwhile too.
+    fn carry_out(&mut self, now: Instant) {
+        while let Some(effect) = self.machine.poll_effect() {
+            let (link, told) = match effect {
+                Effect::ToApp { link, message } => {
+                    (link, self.apps.get(&link).is_none_or(|peer| peer.tell(message)))
+                }
+                Effect::ToNode { link, message } => {
+                    (link, self.nodes.get(&link).is_none_or(|peer| peer.tell(message)))
+                }
+                Effect::Close { link } => {
+                    // The machine has forgotten it already.
+                    self.forget(link);
+                    continue;
+                }
+            };
+            if !told && self.forget(link) {
+                tracing::warn!(%link, "connection closed: the peer is gone or does not read");
+                self.machine.handle(now, Event::LinkClosed { link });
+            }
+        }
+    }
+
+    /// Ends a connection; false if it had ended before.
+    fn forget(&mut self, link: LinkId) -> bool {
+        self.apps.remove(&link).is_some() || self.nodes.remove(&link).is_some()
+    }
+}
+
+/// Talks to the owner; cloneable.
+#[derive(Clone, Debug)]
+pub(crate) struct OwnerHandle(mpsc::Sender<Command>);
+
+impl std::fmt::Debug for Command {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str("Command")
+    }
+}
+
+impl OwnerHandle {
+    /// The handle and the queue for [`Owner::run`].
+    pub(crate) fn new() -> (Self, mpsc::Receiver<Command>) {
+        let (commands, queue) = mpsc::channel(QUEUED_COMMANDS);
+        (Self(commands), queue)
+    }
+
+    /// Waits while the owner is busy; false once it has stopped.
+    pub(crate) async fn send(&self, command: Command) -> bool {
+        self.0.send(command).await.is_ok()
+    }
+
+    /// `None` once the owner has stopped.
+    pub(crate) async fn status(&self) -> Option<FarmStatus> {
+        let (answer, status) = oneshot::channel();
+        self.0.send(Command::Status(answer)).await.ok()?;
+        status.await.ok()
+    }
+
+    /// Whether there is such a node; `None` once the owner has stopped.
+    pub(crate) async fn drain(&self, node: NodeId) -> Option<bool> {
+        let (answer, known) = oneshot::channel();
+        self.0.send(Command::Drain(node, answer)).await.ok()?;
+        known.await.ok()
+    }
+
+    /// Waits until the owner has stopped.
+    pub(crate) async fn stopped(&self) {
+        self.0.closed().await;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use farm_core::{
+        coordinator::CoordinatorConfig,
+        id::Epoch,
+        message::{AppHello, PROTOCOL_VERSION},
+    };
+
+    use super::*;
+
+    #[tokio::test]
+    async fn a_peer_that_does_not_read_is_closed_and_holds_nobody_up() {
+        let (owner, commands) = OwnerHandle::new();
+        let (_stop, stopped) = oneshot::channel();
+        let machine = CoordinatorMachine::new(CoordinatorConfig::new(Epoch(1), 7));
+        tokio::spawn(Owner::new(machine).run(commands, stopped));
+        let open = |link, capacity| {
+            let (outbound, outgoing) = mpsc::channel(capacity);
+            let (alive, ended) = oneshot::channel();
+            let hello =
+                AppHello { protocol: PROTOCOL_VERSION, name: "app".to_owned(), weight: 1.0, resume: None };
+            let said = [
+                Command::AppOpened(link, Peer { outbound, _alive: alive }),
+                Command::FromApp(link, AppToCoordinator::Hello(hello)),
+                Command::FromApp(link, AppToCoordinator::Heartbeat { sequence: 1 }),
+            ];
+            (said, outgoing, ended)
+        };
+        // The first has room for its welcome only, the second for both answers.
+        let (slow_said, mut slow, slow_ended) = open(LinkId(1), 1);
+        let (quick_said, mut quick, mut quick_ended) = open(LinkId(2), 2);
+        for command in slow_said.into_iter().chain(quick_said) {
+            assert!(owner.send(command).await, "the owner runs");
+        }
+        let status = owner.status().await.unwrap();
+        let connected: Vec<bool> = status.apps.iter().map(|app| app.connected).collect();
+        assert_eq!(connected, [false, true], "the slow one lost its connection, the other did not");
+        assert!(slow_ended.await.is_err(), "its reader was told to stop");
+        assert!(
+            matches!(slow.recv().await, Some(Ok(CoordinatorToApp::Welcome { .. }))),
+            "what was queued is sent"
+        );
+        assert!(slow.recv().await.is_none(), "and its stream ends");
+        assert!(matches!(quick.recv().await, Some(Ok(CoordinatorToApp::Welcome { .. }))), "the welcome");
+        assert!(
+            matches!(quick.recv().await, Some(Ok(CoordinatorToApp::HeartbeatAck { sequence: 1 }))),
+            "the answer"
+        );
+        assert!(
+            quick_ended.try_recv().is_err_and(|error| error == oneshot::error::TryRecvError::Empty),
+            "alive"
+        );
+    }
+
+    #[tokio::test]
+    async fn the_owner_stops_when_told() {
+        let (owner, commands) = OwnerHandle::new();
+        let (stop, stopped) = oneshot::channel();
+        let machine = CoordinatorMachine::new(CoordinatorConfig::new(Epoch(1), 7));
+        let task = tokio::spawn(Owner::new(machine).run(commands, stopped));
+        assert_eq!(owner.drain(NodeId(1)).await, Some(false), "no such node");
+        drop(stop);
+        task.await.unwrap();
+        owner.stopped().await;
+        assert_eq!(owner.status().await, None);
+        assert!(!owner.send(Command::Closed(LinkId(1))).await, "nobody takes commands");
+    }
+}

@@ -1,0 +1,155 @@
+//! The farm's status as Prometheus text, base units.
+
+use std::fmt::{self, Display, Write as _};
+
+use farm_core::{
+    coordinator::{FarmStatus, NodeState},
+    device::DeviceKind,
+};
+
+/// One page of metrics.
+pub(super) fn render(status: &FarmStatus) -> String {
+    let mut page = Page(String::with_capacity(4 << 10));
+    let devices =
+        || status.nodes.iter().flat_map(|node| node.devices.iter().map(move |device| (node, device)));
+
+    page.family("gleaner_epoch", "gauge", "Life of the coordinator.");
+    page.sample("gleaner_epoch", &[], status.epoch.0);
+
+    page.family("gleaner_jobs_total", "counter", "Jobs by outcome since this start.");
+    page.sample("gleaner_jobs_total", &[("outcome", &"delivered")], status.delivered_jobs);
+    page.sample("gleaner_jobs_total", &[("outcome", &"replanned")], status.replanned_jobs);
+
+    page.family("gleaner_jobs", "gauge", "Jobs of the registered applications by state.");
+    let waiting: u64 = status.apps.iter().map(|app| app.waiting_jobs).sum();
+    let outstanding: u64 = status.apps.iter().map(|app| app.outstanding_jobs).sum();
+    page.sample("gleaner_jobs", &[("state", &"waiting")], waiting);
+    page.sample("gleaner_jobs", &[("state", &"outstanding")], outstanding);
+
+    page.family("gleaner_nodes", "gauge", "Registered nodes by state.");
+    for (name, state) in
+        [("alive", NodeState::Alive), ("suspect", NodeState::Suspect), ("draining", NodeState::Draining)]
+    {
+        let count = status.nodes.iter().filter(|node| node.state == state).count();
+        page.sample("gleaner_nodes", &[("state", &name)], count);
+    }
+
+    page.family("gleaner_devices", "gauge", "Devices of the registered nodes by kind.");
+    for kind in [DeviceKind::Gpu, DeviceKind::Cpu, DeviceKind::Simulated] {
+        let count = devices().filter(|(_, device)| device.kind == kind).count();
+        page.sample("gleaner_devices", &[("kind", &kind)], count);
+    }
+
+    page.family("gleaner_apps", "gauge", "Registered applications by connection.");
+    let connected = status.apps.iter().filter(|app| app.connected).count();
+    page.sample("gleaner_apps", &[("connected", &"true")], connected);
+    page.sample("gleaner_apps", &[("connected", &"false")], status.apps.len() - connected);
+
+    page.family("gleaner_device_executed_jobs_total", "counter", "Jobs executed by each device.");
+    for (node, device) in devices() {
+        let labels: [Label<'_>; 2] = [("node", &node.name), ("device", &device.device.0)];
+        page.sample("gleaner_device_executed_jobs_total", &labels, device.executed_jobs);
+    }
+    page.family("gleaner_device_time_seconds_total", "counter", "Device time of these jobs.");
+    for (node, device) in devices() {
+        let labels: [Label<'_>; 2] = [("node", &node.name), ("device", &device.device.0)];
+        page.sample("gleaner_device_time_seconds_total", &labels, Seconds(device.device_time_ns));
+    }
+    page.family("gleaner_device_planned_jobs", "gauge", "Jobs planned on each device and not yet executed.");
+    for (node, device) in devices() {
+        let labels: [Label<'_>; 2] = [("node", &node.name), ("device", &device.device.0)];
+        page.sample("gleaner_device_planned_jobs", &labels, device.planned_jobs);
+    }
+    page.family(
+        "gleaner_app_device_time_seconds_total",
+        "counter",
+        "Device time received by each application.",
+    );
+    for app in &status.apps {
+        let labels: [Label<'_>; 2] = [("app", &app.app.0), ("name", &app.name)];
+        page.sample("gleaner_app_device_time_seconds_total", &labels, Seconds(app.device_time_ns));
+    }
+    page.0
+}
+
+type Label<'a> = (&'a str, &'a dyn Display);
+
+/// Nanoseconds, shown as seconds.
+struct Seconds(u64);
+
+impl Display for Seconds {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}.{:09}", self.0 / 1_000_000_000, self.0 % 1_000_000_000)
+    }
+}
+
+/// Text in the exposition format. Writing to a string does not fail.
+struct Page(String);
+
+impl Page {
+    fn family(&mut self, name: &str, kind: &str, help: &str) {
+        let _ = writeln!(self.0, "# HELP {name} {help}\n# TYPE {name} {kind}");
+    }
+
+    fn sample(&mut self, name: &str, labels: &[Label<'_>], value: impl Display) {
+        self.0.push_str(name);
+        for (position, (label, text)) in labels.iter().enumerate() {
+            let text = text.to_string().replace('\\', "\\\\").replace('"', "\\\"").replace('\n', "\\n");
+            let opening = if position == 0 { '{' } else { ',' };
+            let _ = write!(self.0, "{opening}{label}=\"{text}\"");
+        }
+        if !labels.is_empty() {
+            self.0.push('}');
+        }
+        let _ = writeln!(self.0, " {value}");
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::web::samples;
+
+    #[test]
+    fn a_farm_reads_as_prometheus_text() {
+        let text = render(&samples::farm());
+        for line in [
+            "gleaner_epoch 5",
+            "gleaner_jobs_total{outcome=\"delivered\"} 40",
+            "gleaner_jobs_total{outcome=\"replanned\"} 6",
+            "gleaner_jobs{state=\"waiting\"} 1",
+            "gleaner_nodes{state=\"alive\"} 1",
+            "gleaner_nodes{state=\"suspect\"} 0",
+            "gleaner_devices{kind=\"gpu\"} 1",
+            "gleaner_apps{connected=\"true\"} 1",
+            "gleaner_device_executed_jobs_total{node=\"n<script>\",device=\"0\"} 41",
+            "gleaner_device_time_seconds_total{node=\"n<script>\",device=\"0\"} 2.500000000",
+            "gleaner_app_device_time_seconds_total{app=\"9\",name=\"render\"} 0.004000000",
+        ] {
+            assert!(text.lines().any(|found| found == line), "{line} is missing in\n{text}");
+        }
+    }
+
+    #[test]
+    fn every_sample_belongs_to_a_family_told_before() {
+        let text = render(&samples::farm());
+        let mut families = Vec::new();
+        for line in text.lines() {
+            match line.strip_prefix("# TYPE ") {
+                Some(family) => families.push(family.split(' ').next().unwrap().to_owned()),
+                None if line.starts_with('#') => {}
+                None => {
+                    let name = line.split(['{', ' ']).next().unwrap();
+                    assert_eq!(families.last().map(String::as_str), Some(name), "{line}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn labels_are_escaped() {
+        let mut page = Page(String::new());
+        page.sample("a", &[("b", &"x\"y\\z\nw")], 1);
+        assert_eq!(page.0, "a{b=\"x\\\"y\\\\z\\nw\"} 1\n");
+    }
+}
