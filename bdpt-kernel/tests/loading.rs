@@ -54,7 +54,8 @@ fn refused_toml(toml: &str) -> String {
 
 #[test]
 fn a_scene_loads_by_file_and_by_folder() {
-    let folder = folder(&[("scene.toml", SCENE.as_bytes()), ("a.obj", OBJ.as_bytes()), ("a.mtl", MTL.as_bytes())]);
+    let folder =
+        folder(&[("scene.toml", SCENE.as_bytes()), ("a.obj", OBJ.as_bytes()), ("a.mtl", MTL.as_bytes())]);
     for path in [folder.path().to_owned(), folder.path().join("scene.toml")] {
         let LoadedScene { scene, report } = scene::load(&path).unwrap();
         assert_eq!((scene.film.width_px, scene.film.height_px), (64, 48));
@@ -103,50 +104,101 @@ fn every_mistake_in_a_description_names_line_and_key() {
         (with("width = 64", "width = -64"), "scene.toml:3: film.width: -64 must be"),
         (with("width = 64", "width = 99999999999"), "scene.toml:3: film.width: 99999999999 must be"),
         (with("width = 64", "width = 1.5"), "scene.toml:3: "),
-        (with("width = 64\nheight = 48", "width = 16000\nheight = 16000"), "scene.toml:3: film: image size 16000x16000"),
+        (
+            with("width = 64\nheight = 48", "width = 16000\nheight = 16000"),
+            "scene.toml:3: film: image size 16000x16000",
+        ),
         (with("width = 64\n", ""), "missing field `width`"),
         (with("width = 64", "wdith = 64"), "scene.toml:3: unknown field `wdith`"),
         (with("[film]", "[fim]"), "unknown field `fim`"),
         (with("eye = [0, 0, 5]", "eye = [0, 0, 0]"), "scene.toml:7: camera.target: equals camera.eye"),
         (with("eye = [0, 0, 5]", "eye = [0, 0]"), "scene.toml:6: "),
         (with("eye = [0, 0, 5]", "eye = [0, nan, 5]"), "scene.toml:6: camera.eye: NaN must be finite"),
-        (with("target = [0, 0, 0]", "target = [inf, 0, 0]"), "scene.toml:7: camera.target: inf must be finite"),
+        (
+            with("target = [0, 0, 0]", "target = [inf, 0, 0]"),
+            "scene.toml:7: camera.target: inf must be finite",
+        ),
         (with("up = [0, 1, 0]", "up = [0, 0, 1]"), "scene.toml:8: camera.up: is parallel"),
         (with("up = [0, 1, 0]", "up = [0, 0, 0]"), "scene.toml:8: camera.up: must not be zero"),
         (with("hfov_deg = 40", "hfov_deg = 0"), "scene.toml:9: camera.hfov_deg: 0 must be between"),
         (with("hfov_deg = 40", "hfov_deg = 180"), "scene.toml:9: camera.hfov_deg: 180 must be between"),
         (with("hfov_deg = 40", "hfov_deg = nan"), "scene.toml:9: camera.hfov_deg: NaN must be between"),
         (with("hfov_deg = 40", "hfov_deg = \"wide\""), "scene.toml:9: "),
-        (with("hfov_deg = 40", "hfov_deg = 40\nlens_radius = 0.1"), "scene.toml:10: a thin lens (camera.lens_radius) is not supported yet"),
-        (with("hfov_deg = 40", "hfov_deg = 40\nlens_radius = -1"), "scene.toml:10: camera.lens_radius: -1 must be"),
-        (with("radiance = [1, 1, 1]", "radiance = [1, -1, 1]"), "scene.toml:11: environment.radiance: -1 must be"),
-        (with("radiance = [1, 1, 1]", "map = \"sky.exr\""), "scene.toml:11: an environment map (environment.map) is not supported yet"),
-        (with("radiance = [1, 1, 1]", "scale = 2"), "scene.toml:11: environment.scale: belongs to environment.map"),
+        (
+            with("hfov_deg = 40", "hfov_deg = 40\nlens_radius = 0.1"),
+            "scene.toml:10: a thin lens (camera.lens_radius) is not supported yet",
+        ),
+        (
+            with("hfov_deg = 40", "hfov_deg = 40\nlens_radius = -1"),
+            "scene.toml:10: camera.lens_radius: -1 must be",
+        ),
+        (
+            with("radiance = [1, 1, 1]", "radiance = [1, -1, 1]"),
+            "scene.toml:11: environment.radiance: -1 must be",
+        ),
+        (
+            with("radiance = [1, 1, 1]", "map = \"sky.exr\""),
+            "scene.toml:11: an environment map (environment.map) is not supported yet",
+        ),
+        (
+            with("radiance = [1, 1, 1]", "scale = 2"),
+            "scene.toml:11: environment.scale: belongs to environment.map",
+        ),
         (with("radiance = [1, 1, 1]", ""), "environment: needs `radiance`"),
-        (light("type = \"point\"\nposition = [0, 1, 0]\nintensity = [1, 1, 1]"), "scene.toml:12: a point light ([[light]]) is not supported yet"),
-        (light("type = \"directional\"\ndirection = [0, 1, 0]\nirradiance = [1, 1, 1]"), "a directional light ([[light]]) is not supported yet"),
+        (
+            light("type = \"point\"\nposition = [0, 1, 0]\nintensity = [1, 1, 1]"),
+            "scene.toml:12: a point light ([[light]]) is not supported yet",
+        ),
+        (
+            light("type = \"directional\"\ndirection = [0, 1, 0]\nirradiance = [1, 1, 1]"),
+            "a directional light ([[light]]) is not supported yet",
+        ),
         (light("type = \"point\"\nposition = [0, 1, 0]"), "light.intensity: is missing"),
-        (light("type = \"point\"\nposition = [0, 1, 0]\nintensity = [1, 1, nan]"), "scene.toml:15: light.intensity: NaN must be finite"),
+        (
+            light("type = \"point\"\nposition = [0, 1, 0]\nintensity = [1, 1, nan]"),
+            "scene.toml:15: light.intensity: NaN must be finite",
+        ),
         (light("type = \"spot\""), "scene.toml:13: light.type: unknown type \"spot\""),
         (light("type = \"point\"\nradius = 1"), "scene.toml:14: unknown field `radius`"),
         (material("type = \"velvet\""), "scene.toml:13: materials.\"white\".type: unknown type \"velvet\""),
         (material("type = 3"), "scene.toml:13: "),
         (material("reflectance = [0, 0, 0]"), "missing field `type`"),
         (material("type = \"diffuse\"\ncolour = [1, 1, 1]"), "scene.toml:14: unknown field `colour`"),
-        (material("type = \"diffuse\"\nreflectance = [1, 1.5, 1]"), "scene.toml:14: materials.\"white\".reflectance: 1.5 must be in 0..1"),
-        (material("type = \"diffuse\"\nreflectance = [1, nan, 1]"), "materials.\"white\".reflectance: NaN must be in 0..1"),
+        (
+            material("type = \"diffuse\"\nreflectance = [1, 1.5, 1]"),
+            "scene.toml:14: materials.\"white\".reflectance: 1.5 must be in 0..1",
+        ),
+        (
+            material("type = \"diffuse\"\nreflectance = [1, nan, 1]"),
+            "materials.\"white\".reflectance: NaN must be in 0..1",
+        ),
         (material("type = \"diffuse\"\nreflectance = [1, 1]"), "scene.toml:14: "),
         (material("type = \"diffuse\"\nemission = [1, -1, 1]"), "materials.\"white\".emission: -1 must be"),
         (material("type = \"diffuse\"\nemission = [1, inf, 1]"), "materials.\"white\".emission: inf must be"),
-        (material("type = \"diffuse\"\nior = 1.5"), "scene.toml:14: materials.\"white\".ior: does not belong to type \"diffuse\""),
+        (
+            material("type = \"diffuse\"\nior = 1.5"),
+            "scene.toml:14: materials.\"white\".ior: does not belong to type \"diffuse\"",
+        ),
         (material("type = \"dielectric\""), "materials.\"white\".ior: is missing"),
         (material("type = \"dielectric\"\nior = 0"), "materials.\"white\".ior: 0 must be positive"),
         (material("type = \"rough_conductor\""), "materials.\"white\".alpha: is missing"),
         (material("type = \"rough_conductor\"\nalpha = 0"), "materials.\"white\".alpha: 0 must be in 0..1"),
-        (material("type = \"rough_conductor\"\nalpha_u = 0.1"), "materials.\"white\".alpha_u: and alpha_v belong together"),
-        (material("type = \"rough_conductor\"\nalpha = 0.1\nalpha_u = 0.1\nalpha_v = 0.1"), "alpha: and alpha_u, alpha_v exclude"),
-        (material("type = \"rough_conductor\"\nalpha = 0.1\neta = [1, 1, 1]"), "materials.\"white\".eta: needs `k` too"),
-        (material("type = \"rough_conductor\"\nalpha = 0.1\ndistribution = \"phong\""), "unknown distribution \"phong\""),
+        (
+            material("type = \"rough_conductor\"\nalpha_u = 0.1"),
+            "materials.\"white\".alpha_u: and alpha_v belong together",
+        ),
+        (
+            material("type = \"rough_conductor\"\nalpha = 0.1\nalpha_u = 0.1\nalpha_v = 0.1"),
+            "alpha: and alpha_u, alpha_v exclude",
+        ),
+        (
+            material("type = \"rough_conductor\"\nalpha = 0.1\neta = [1, 1, 1]"),
+            "materials.\"white\".eta: needs `k` too",
+        ),
+        (
+            material("type = \"rough_conductor\"\nalpha = 0.1\ndistribution = \"phong\""),
+            "unknown distribution \"phong\"",
+        ),
     ] {
         let error = refused_toml(&toml);
         assert!(error.contains(expected), "{toml}\nexpected {expected}\ngot {error}");
@@ -181,8 +233,15 @@ fn files_that_are_no_text_or_not_there_are_named() {
 fn material_libraries_stay_inside_the_folder() {
     for name in ["/etc/passwd", "../a.mtl", "sub/../../a.mtl", "..\\a.mtl", "C:\\a.mtl"] {
         let obj = OBJ.replace("a.mtl", name);
-        let error = refused(&[("scene.toml", SCENE.as_bytes()), ("a.obj", obj.as_bytes()), ("a.mtl", MTL.as_bytes())]);
-        assert!(error.starts_with(&format!("a.obj:1: material library \"{name}\" leaves the scene's folder")), "{error}");
+        let error = refused(&[
+            ("scene.toml", SCENE.as_bytes()),
+            ("a.obj", obj.as_bytes()),
+            ("a.mtl", MTL.as_bytes()),
+        ]);
+        assert!(
+            error.starts_with(&format!("a.obj:1: material library \"{name}\" leaves the scene's folder")),
+            "{error}"
+        );
     }
     let inside = OBJ.replace("a.mtl", "looks\\plain white.mtl");
     let folder = folder(&[
@@ -201,9 +260,15 @@ fn materials_are_found_or_named() {
 
     let no_library = unknown.replace("mtllib a.mtl\n", "");
     let loaded = scene_of(SCENE, &no_library, MTL).unwrap();
-    assert!(loaded.report.warnings[0].contains("material \"black\" is defined nowhere"), "{:?}", loaded.report);
+    assert!(
+        loaded.report.warnings[0].contains("material \"black\" is defined nowhere"),
+        "{:?}",
+        loaded.report
+    );
 
-    let by_toml = format!("{SCENE}[materials.\"black\"]\ntype = \"mirror\"\n[materials.\"unused\"]\ntype = \"mirror\"\n");
+    let by_toml = format!(
+        "{SCENE}[materials.\"black\"]\ntype = \"mirror\"\n[materials.\"unused\"]\ntype = \"mirror\"\n"
+    );
     for obj in [&unknown, &no_library] {
         let loaded = scene_of(&by_toml, obj, MTL).unwrap();
         assert_eq!(loaded.scene.materials[0].bsdf, Bsdf::Mirror { reflectance: Vec3::ONE });
@@ -225,7 +290,9 @@ fn looks_that_cannot_be_rendered_yet_are_counted_and_named() {
         ("type = \"rough_dielectric\"\nior = 1.5\nalpha = 0.1\ndistribution = \"beckmann\"", 0.5),
     ] {
         let loaded = scene_of(&format!("{SCENE}[materials.\"white\"]\n{entry}"), OBJ, MTL).unwrap();
-        let Bsdf::Diffuse { reflectance } = loaded.scene.materials[0].bsdf else { panic!("{entry} is not diffuse") };
+        let Bsdf::Diffuse { reflectance } = loaded.scene.materials[0].bsdf else {
+            panic!("{entry} is not diffuse")
+        };
         assert!((reflectance - Vec3::splat(albedo)).abs().max_element() < 1e-6, "{entry}: {reflectance}");
         let kind = entry.split('"').nth(1).unwrap();
         let expected = format!("material \"white\" ({kind}) is not supported yet: rendered as diffuse");
@@ -242,9 +309,15 @@ fn a_scene_without_light_is_refused() {
         assert!(error.to_string().contains("scene.toml: the scene has no light"), "{error}");
     }
     let unused_lamp = format!("{dark}[materials.\"lamp\"]\ntype = \"diffuse\"\nemission = [1, 1, 1]\n");
-    assert!(matches!(scene_of(&unused_lamp, OBJ, MTL), Err(SceneError::NoLight { .. })), "a lamp nobody uses");
+    assert!(
+        matches!(scene_of(&unused_lamp, OBJ, MTL), Err(SceneError::NoLight { .. })),
+        "a lamp nobody uses"
+    );
     let lamp = scene_of(&dark, OBJ, &format!("{MTL}Ke 1 2 3\n")).unwrap();
-    assert_eq!((lamp.scene.materials[0].emission, lamp.report.emitting_triangles), (Vec3::new(1.0, 2.0, 3.0), 2));
+    assert_eq!(
+        (lamp.scene.materials[0].emission, lamp.report.emitting_triangles),
+        (Vec3::new(1.0, 2.0, 3.0), 2)
+    );
 }
 
 #[test]
@@ -284,6 +357,9 @@ fn numbers_in_a_file_never_size_memory() {
     // A few bytes that name huge indices must fail at once, not allocate.
     for face in ["f 1 2 4000000000", "f 1 2 -4000000000", "f 1/4000000000 2 3", "f 1 2 9223372036854775807"] {
         let error = scene_of(SCENE, &format!("{OBJ}{face}\n"), MTL).unwrap_err().to_string();
-        assert!(error.contains("a.obj:9: object \"square\": ") && error.contains("out of range"), "{face}: {error}");
+        assert!(
+            error.contains("a.obj:9: object \"square\": ") && error.contains("out of range"),
+            "{face}: {error}"
+        );
     }
 }
