@@ -1,1 +1,278 @@
-//! placeholder
+//! The worker daemon's library: a thin driver around `farm_core::worker::WorkerMachine`.
+//!
+//! It owns sockets, clocks, payload bytes (programs, contents, results) and the devices' executors; it decides
+//! nothing about jobs. One task owns the machine; everything else sends it inputs.
+
+mod content;
+mod device;
+mod driver;
+mod link;
+mod payload;
+mod session;
+
+use std::{net::SocketAddr, path::PathBuf, sync::Arc, time::Duration};
+
+use farm_core::{
+    device::DeviceInfo,
+    id::{NodeId, NodeSession},
+    message::Contact,
+    worker::WorkerConfig,
+};
+use gpu_exec::{DeviceSpec, ExecutorConfig, OpenError};
+use proto::{
+    control::SessionError,
+    link::{BindError, DataServer},
+};
+use thiserror::Error;
+use tokio::{
+    sync::{mpsc, oneshot},
+    task::JoinHandle,
+};
+
+use self::driver::{Input, QUEUED_INPUTS, Setup};
+
+/// Most jobs a worker holds, executed and unacknowledged ones too; further ones go back to the coordinator.
+const MAX_JOBS: usize = 65_536;
+/// Gain of the lottery's feedback (10-scheduling.md section 2).
+const LOTTERY_GAIN: f64 = 0.15;
+
+/// Settings of a worker.
+#[derive(Clone, Debug)]
+pub struct WorkerOptions {
+    /// `host:port` of the coordinator.
+    pub coordinator: String,
+    /// Address of the data plane (UDP); port 0 lets the system choose.
+    pub listen: SocketAddr,
+    /// `host:port` addresses under which applications reach the data plane; the listening one when empty.
+    pub advertise: Vec<String>,
+    /// For people, and the node's identity over restarts: a second worker of one name takes the first one's place.
+    pub name: String,
+    /// The devices to open.
+    pub devices: Vec<DeviceSpec>,
+    /// How long the coordinator is tried at the start.
+    pub connect_timeout: Duration,
+    /// Most bytes of task allocations and modules kept in memory.
+    pub content_cache_bytes: u64,
+    /// How long one job may run.
+    pub job_limit: Duration,
+    /// A folder for caches on disk. Checked to be writable; what is cached there comes with a later version.
+    pub cache: Option<PathBuf>,
+}
+
+impl WorkerOptions {
+    /// On loopback, with a port of the system's choice: what an embedded farm and tests use.
+    #[must_use]
+    pub fn embedded(coordinator: String, devices: Vec<DeviceSpec>) -> Self {
+        Self {
+            coordinator,
+            listen: SocketAddr::from(([127, 0, 0, 1], 0)),
+            advertise: Vec::new(),
+            name: format!("worker-{}", std::process::id()),
+            devices,
+            connect_timeout: Duration::from_secs(10),
+            content_cache_bytes: 4 << 30,
+            job_limit: Duration::from_secs(600),
+            cache: None,
+        }
+    }
+}
+
+/// A worker could not start.
+#[derive(Debug, Error)]
+pub enum StartError {
+    /// A device cannot be opened.
+    #[error(transparent)]
+    Device(#[from] OpenError),
+    /// Not one device was asked for.
+    #[error("no device: name one with --device (all, gpu:N, cpu, sim)")]
+    NoDevice,
+    /// The data plane's address cannot be had.
+    #[error(transparent)]
+    Listen(#[from] BindError),
+    /// The cache folder cannot be used.
+    #[error("cache folder {}: {source}", path.display())]
+    Cache {
+        /// Which.
+        path: PathBuf,
+        /// Why not.
+        source: std::io::Error,
+    },
+    /// The coordinator cannot be reached. May be retried.
+    #[error("{0} (tried for {1:?})")]
+    Unreachable(#[source] SessionError, Duration),
+    /// The coordinator does not want this node.
+    #[error("the coordinator refused this node: {reason}")]
+    Refused {
+        /// Its reason.
+        reason: String,
+    },
+    /// The process lacks something of the system's.
+    #[error("{0}")]
+    System(#[from] std::io::Error),
+}
+
+/// Why a worker ended.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum End {
+    /// Drained: it holds no job any more and said goodbye.
+    Drained,
+    /// The coordinator does not want it any more.
+    Refused {
+        /// Its reason.
+        reason: String,
+    },
+    /// It could not go on.
+    Failed {
+        /// Why.
+        reason: String,
+    },
+}
+
+/// What a running worker is.
+#[derive(Clone, Debug, PartialEq)]
+pub struct WorkerInfo {
+    /// Its name.
+    pub name: String,
+    /// Its id at the coordinator.
+    pub node: NodeId,
+    /// Where its data plane listens.
+    pub data: SocketAddr,
+    /// Its devices.
+    pub devices: Vec<DeviceInfo>,
+}
+
+/// A running worker. Dropping it stops it without draining.
+#[derive(Debug)]
+pub struct WorkerHandle {
+    info: WorkerInfo,
+    inputs: mpsc::Sender<Input>,
+    driver: JoinHandle<End>,
+}
+
+impl WorkerHandle {
+    /// What it is.
+    #[must_use]
+    pub const fn info(&self) -> &WorkerInfo {
+        &self.info
+    }
+
+    /// Asks it to take no new work, finish what runs and leave; [`Self::ended`] resolves when it has.
+    pub async fn begin_drain(&self) {
+        // A driver that is gone has nothing to drain.
+        let _ = self.inputs.send(Input::Drain).await;
+    }
+
+    /// Waits until it ends by itself. Cancel-safe.
+    pub async fn ended(&mut self) -> End {
+        match (&mut self.driver).await {
+            Ok(end) => end,
+            Err(error) => End::Failed { reason: format!("the worker's task ended: {error}") },
+        }
+    }
+
+    /// Takes no new work, finishes what runs, delivers it (for a bounded time), says goodbye and ends.
+    pub async fn drain(mut self) -> End {
+        self.begin_drain().await;
+        self.ended().await
+    }
+}
+
+impl Drop for WorkerHandle {
+    fn drop(&mut self) {
+        self.driver.abort();
+    }
+}
+
+/// Opens the devices, listens, registers, and runs until drained.
+///
+/// # Errors
+/// A device or address cannot be had, or the coordinator cannot be reached in time or refuses.
+pub async fn start(options: WorkerOptions) -> Result<WorkerHandle, StartError> {
+    if let Some(path) = &options.cache {
+        check_cache(path).map_err(|source| StartError::Cache { path: path.clone(), source })?;
+    }
+    let (events_sender, events) = mpsc::unbounded_channel();
+    let devices = open_devices(options.devices.clone(), events_sender).await?;
+    let infos: Vec<DeviceInfo> = devices.iter().map(|executor| executor.info().clone()).collect();
+    let server = Arc::new(DataServer::bind(options.listen)?);
+    let data = server.local_addr();
+    let advertise =
+        if options.advertise.is_empty() { vec![data.to_string()] } else { options.advertise.clone() };
+    let identity = random_u64()?;
+    let config = WorkerConfig {
+        name: options.name.clone(),
+        session: NodeSession(identity),
+        devices: infos.clone(),
+        contact: Contact { addresses: advertise, certificate_der: server.certificate_der().to_vec() },
+        max_jobs: MAX_JOBS,
+        lottery_gain: LOTTERY_GAIN,
+        seed: identity,
+    };
+    let session = session::first(&options.coordinator, options.connect_timeout)
+        .await
+        .map_err(|error| StartError::Unreachable(error, options.connect_timeout))?;
+
+    let (inputs, received) = mpsc::channel(QUEUED_INPUTS);
+    let (registered, registration) = oneshot::channel();
+    let setup = Setup {
+        options: options.clone(),
+        config,
+        devices,
+        events,
+        server,
+        session,
+        inputs: inputs.clone(),
+        received,
+        registered,
+    };
+    let mut driver = tokio::spawn(driver::drive(setup));
+    let timeout = tokio::time::sleep(options.connect_timeout);
+    let node = tokio::select! {
+        Ok(node) = registration => node,
+        end = &mut driver => {
+            let reason = match end {
+                Ok(End::Refused { reason } | End::Failed { reason }) => reason,
+                Ok(End::Drained) => "it ended before it was registered".to_owned(),
+                Err(error) => error.to_string(),
+            };
+            return Err(StartError::Refused { reason });
+        }
+        () = timeout => {
+            driver.abort();
+            let reason = "no answer to the registration".to_owned();
+            return Err(StartError::Unreachable(SessionError::Ended { reason }, options.connect_timeout));
+        }
+    };
+    Ok(WorkerHandle { info: WorkerInfo { name: options.name, node, data, devices: infos }, inputs, driver })
+}
+
+/// Opens the executors on a thread that may block: a score is measured for up to a second a device.
+async fn open_devices(
+    specs: Vec<DeviceSpec>,
+    events: mpsc::UnboundedSender<device::DeviceEvent>,
+) -> Result<Vec<gpu_exec::Executor>, StartError> {
+    let opening = tokio::task::spawn_blocking(move || {
+        gpu_exec::open(&specs, ExecutorConfig::default(), move |index, event| {
+            // The driver is gone only when the worker ends: nobody is left to hear.
+            let _ = events.send(device::DeviceEvent::of(index, event));
+        })
+    });
+    let devices = opening.await.map_err(std::io::Error::other)??;
+    if devices.is_empty() { Err(StartError::NoDevice) } else { Ok(devices) }
+}
+
+fn check_cache(path: &std::path::Path) -> std::io::Result<()> {
+    std::fs::create_dir_all(path)?;
+    let probe = path.join(format!(".probe-{}", std::process::id()));
+    std::fs::write(&probe, b"")?;
+    std::fs::remove_file(&probe)
+}
+
+/// Entropy for the session's identity, from the system.
+fn random_u64() -> std::io::Result<u64> {
+    use std::io::Read as _;
+
+    let mut bytes = [0; 8];
+    std::fs::File::open("/dev/urandom")?.read_exact(&mut bytes)?;
+    Ok(u64::from_le_bytes(bytes))
+}

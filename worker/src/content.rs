@@ -1,0 +1,118 @@
+//! Task allocations and modules in memory: least recently used out, pinned ones stay. Fetches nothing itself.
+
+use std::collections::{BTreeMap, HashMap};
+
+use bytes::Bytes;
+use farm_core::id::ContentHash;
+
+/// The node's contents in memory.
+#[derive(Debug)]
+pub(crate) struct ContentCache {
+    entries: HashMap<ContentHash, Entry>,
+    /// Unpinned entries by last use.
+    idle: BTreeMap<u64, ContentHash>,
+    bytes: u64,
+    cap_bytes: u64,
+    uses: u64,
+}
+
+#[derive(Debug)]
+struct Entry {
+    bytes: Bytes,
+    /// When it was used last; meaningless while pinned.
+    last_use: u64,
+    pinned: bool,
+}
+
+/// A content does not fit beside the pinned ones.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct CacheFull {
+    pub(crate) pinned_bytes: u64,
+    pub(crate) cap_bytes: u64,
+}
+
+impl ContentCache {
+    pub(crate) fn new(cap_bytes: u64) -> Self {
+        Self { entries: HashMap::new(), idle: BTreeMap::new(), bytes: 0, cap_bytes, uses: 0 }
+    }
+
+    /// Keeps a content until it is released; false if it is not here.
+    pub(crate) fn pin(&mut self, hash: ContentHash) -> bool {
+        let Some(entry) = self.entries.get_mut(&hash) else { return false };
+        if !std::mem::replace(&mut entry.pinned, true) {
+            self.idle.remove(&entry.last_use);
+        }
+        true
+    }
+
+    /// Lets a content be evicted when room is needed.
+    pub(crate) fn release(&mut self, hash: ContentHash) {
+        let Some(entry) = self.entries.get_mut(&hash) else { return };
+        if std::mem::replace(&mut entry.pinned, false) {
+            self.uses += 1;
+            entry.last_use = self.uses;
+            self.idle.insert(self.uses, hash);
+        }
+    }
+
+    /// Takes a content in, pinned; evicts idle ones for it.
+    pub(crate) fn insert(&mut self, hash: ContentHash, bytes: Bytes) -> Result<(), CacheFull> {
+        if self.pin(hash) {
+            return Ok(());
+        }
+        let size_bytes = bytes.len() as u64;
+        while self.bytes + size_bytes > self.cap_bytes {
+            let Some((_, oldest)) = self.idle.pop_first() else {
+                return Err(CacheFull { pinned_bytes: self.bytes, cap_bytes: self.cap_bytes });
+            };
+            if let Some(evicted) = self.entries.remove(&oldest) {
+                self.bytes -= evicted.bytes.len() as u64;
+            }
+        }
+        self.bytes += size_bytes;
+        self.entries.insert(hash, Entry { bytes, last_use: 0, pinned: true });
+        Ok(())
+    }
+
+    /// The bytes of a content that is here.
+    pub(crate) fn get(&self, hash: &ContentHash) -> Option<Bytes> {
+        self.entries.get(hash).map(|entry| entry.bytes.clone())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn content(tag: u8, size_bytes: usize) -> (ContentHash, Bytes) {
+        (ContentHash([tag; 32]), Bytes::from(vec![tag; size_bytes]))
+    }
+
+    #[test]
+    fn the_least_recently_used_idle_content_goes_first() {
+        let mut cache = ContentCache::new(100);
+        let [(a, a_bytes), (b, b_bytes), (c, c_bytes)] = [content(1, 40), content(2, 40), content(3, 40)];
+        cache.insert(a, a_bytes).unwrap();
+        cache.insert(b, b_bytes).unwrap();
+        cache.release(a);
+        cache.release(b);
+        assert!(cache.pin(a), "a is here");
+        cache.release(a);
+        cache.insert(c, c_bytes).unwrap();
+        assert!(cache.get(&b).is_none(), "b was used before a");
+        assert!(cache.get(&a).is_some() && cache.get(&c).is_some(), "only one had to go");
+    }
+
+    #[test]
+    fn pinned_contents_stay_and_the_cap_holds() {
+        let mut cache = ContentCache::new(100);
+        let [(a, a_bytes), (b, b_bytes)] = [content(1, 60), content(2, 60)];
+        cache.insert(a, a_bytes.clone()).unwrap();
+        cache.insert(a, a_bytes).unwrap();
+        assert_eq!(cache.bytes, 60, "the same content is held once");
+        assert_eq!(cache.insert(b, b_bytes.clone()), Err(CacheFull { pinned_bytes: 60, cap_bytes: 100 }));
+        cache.release(a);
+        cache.insert(b, b_bytes).unwrap();
+        assert!(cache.get(&a).is_none(), "the cap holds");
+    }
+}

@@ -1,0 +1,123 @@
+//! What the executors say, with each result's digest computed where the result was made: on the device's own thread, not on
+//! the owner task.
+
+use std::{collections::VecDeque, time::Duration};
+
+use bytes::Bytes;
+use farm_core::{
+    id::{ContentHash, DeviceIndex, JobAttempt},
+    message::JobFailure,
+};
+use gpu_exec::{Executor, ExecutorEvent, Order};
+
+/// An executor's jobs: one running, one staged.
+const EXECUTOR_DEPTH: usize = 2;
+
+/// What an executor says.
+#[derive(Debug)]
+pub(crate) struct DeviceEvent {
+    pub(crate) device: DeviceIndex,
+    pub(crate) what: DeviceNews,
+}
+
+#[derive(Debug)]
+pub(crate) enum DeviceNews {
+    Started(JobAttempt),
+    Finished { job: JobAttempt, device_time_ns: u64, outcome: Result<Payload, JobFailure> },
+    Lost(String),
+}
+
+/// A result's bytes with what its header says of them.
+#[derive(Debug)]
+pub(crate) struct Payload {
+    pub(crate) sections: Vec<Bytes>,
+    pub(crate) digest: ContentHash,
+}
+
+impl DeviceEvent {
+    /// Takes an executor's event over; hashes a result.
+    pub(crate) fn of(device: DeviceIndex, event: ExecutorEvent) -> Self {
+        let what = match event {
+            ExecutorEvent::Started { job } => DeviceNews::Started(job),
+            ExecutorEvent::Finished { job, device_time_ns, outcome } => {
+                DeviceNews::Finished { job, device_time_ns, outcome: outcome.map(Payload::of) }
+            }
+            ExecutorEvent::Lost { reason } => DeviceNews::Lost(reason),
+        };
+        Self { device, what }
+    }
+}
+
+impl Payload {
+    fn of(sections: Vec<Bytes>) -> Self {
+        let mut hasher = blake3::Hasher::new();
+        for section in &sections {
+            hasher.update(section);
+        }
+        Self { digest: ContentHash(*hasher.finalize().as_bytes()), sections }
+    }
+}
+
+/// A device's executor, and orders that wait while it winds an aborted job up.
+#[derive(Debug)]
+pub(crate) struct Device {
+    executor: Executor,
+    /// Orders submitted and not finished.
+    held: usize,
+    /// At most [`EXECUTOR_DEPTH`]: the machine counts an aborted job's place as free at once.
+    waiting: VecDeque<Order>,
+}
+
+impl Device {
+    pub(crate) const fn new(executor: Executor) -> Self {
+        Self { executor, held: 0, waiting: VecDeque::new() }
+    }
+
+    /// Hands an order over, or keeps it until there is room.
+    pub(crate) fn execute(&mut self, order: Order) {
+        self.waiting.push_back(order);
+        self.submit_waiting();
+    }
+
+    /// A job ended: there is room for a waiting one.
+    pub(crate) fn finished(&mut self) {
+        self.held = self.held.saturating_sub(1);
+        self.submit_waiting();
+    }
+
+    /// Takes a job back; true if it had not reached the executor, which then says nothing more about it.
+    pub(crate) fn abort(&mut self, job: JobAttempt) -> bool {
+        let before = self.waiting.len();
+        self.waiting.retain(|order| order.job != job);
+        let removed = self.waiting.len() < before;
+        if !removed {
+            self.executor.abort(job);
+        }
+        removed
+    }
+
+    fn submit_waiting(&mut self) {
+        while self.held < EXECUTOR_DEPTH {
+            let Some(order) = self.waiting.pop_front() else { return };
+            let job = order.job;
+            match self.executor.submit(order) {
+                Ok(()) => self.held += 1,
+                // Only a lost device is busy below its depth; it says so itself, and the machine moves its jobs.
+                Err(busy) => {
+                    tracing::warn!(%job, %busy, "an executor took no order");
+                    return;
+                }
+            }
+        }
+    }
+}
+
+/// An order for a device.
+pub(crate) fn order(
+    job: JobAttempt,
+    program: farm_core::program::JobProgram,
+    contents: Vec<(ContentHash, Bytes)>,
+    limit: Duration,
+) -> Order {
+    Order { job, program: std::sync::Arc::new(program), contents, limit }
+}

@@ -1,0 +1,435 @@
+//! The task that owns the worker's machine: it turns what the coordinator, applications and devices say into events, and
+//! carries the machine's effects out. It never waits for a peer.
+
+use std::{
+    collections::{HashMap, HashSet},
+    sync::Arc,
+    time::Instant,
+};
+
+use bytes::Bytes;
+use farm_core::{
+    id::{ContentHash, DeviceIndex, JobAttempt, LinkId, NodeId},
+    message::{AppToNode, CoordinatorToNode, JobFailure, NodeToApp, NodeToCoordinator},
+    program::{Command, Content, JobProgram},
+    time,
+    worker::{Effect, Event, WorkerConfig, WorkerMachine},
+};
+use gpu_exec::Executor;
+use proto::{
+    codec,
+    control::{SessionError, SessionSender},
+    link::{DataServer, FetchError, Frame, LinkSender},
+};
+use tokio::{
+    sync::{mpsc, oneshot},
+    task::JoinSet,
+};
+
+use crate::{
+    End, WorkerOptions,
+    content::ContentCache,
+    device::{self, Device, DeviceEvent, DeviceNews},
+    link::{self, Outbox},
+    payload::Payloads,
+    session::{self, NodeLink},
+};
+
+/// Inputs that wait for the owner task, at most; further senders wait.
+pub(crate) const QUEUED_INPUTS: usize = 1_024;
+/// Inputs taken in before effects are carried out.
+const INPUTS_PER_TURN: usize = 128;
+/// Device events taken in while effects are carried out.
+const ANSWERS_PER_TURN: usize = 256;
+
+/// What the owner task hears.
+#[derive(Debug)]
+pub(crate) enum Input {
+    /// The coordinator is connected again.
+    Connected(NodeLink),
+    /// The coordinator said something in session `serial`.
+    CoordinatorSaid { serial: u64, message: CoordinatorToNode },
+    /// Session `serial` is over.
+    CoordinatorEnded { serial: u64, error: SessionError },
+    /// An application dialled.
+    LinkOpened { link: LinkId, sender: LinkSender<NodeToApp> },
+    /// An application said this, in order.
+    AppSaid { link: LinkId, frames: Vec<Frame<AppToNode>> },
+    /// An application's link is over.
+    LinkEnded { link: LinkId },
+    /// A fetch is through.
+    Fetched { content: Content, result: Result<Bytes, FetchError> },
+    /// The process was asked to end in order.
+    Drain,
+}
+
+/// What a driver is made of.
+pub(crate) struct Setup {
+    pub(crate) options: WorkerOptions,
+    pub(crate) config: WorkerConfig,
+    pub(crate) devices: Vec<Executor>,
+    /// Unbounded for its senders, who must not wait; a device has at most three jobs and two events of each.
+    pub(crate) events: mpsc::UnboundedReceiver<DeviceEvent>,
+    pub(crate) server: Arc<DataServer>,
+    pub(crate) session: NodeLink,
+    pub(crate) inputs: mpsc::Sender<Input>,
+    pub(crate) received: mpsc::Receiver<Input>,
+    pub(crate) registered: oneshot::Sender<NodeId>,
+}
+
+/// The owner of the machine.
+struct Driver {
+    machine: WorkerMachine,
+    /// Origin of the machine's time.
+    origin: Instant,
+    options: WorkerOptions,
+    inputs: mpsc::Sender<Input>,
+    coordinator: Option<SessionSender<NodeToCoordinator>>,
+    /// Counts sessions: news of an older one are of no interest.
+    serial: u64,
+    links: HashMap<LinkId, Outbox>,
+    devices: Vec<Device>,
+    contents: ContentCache,
+    /// Fetches on the way, and whether the machine still waits for them.
+    fetching: HashMap<ContentHash, bool>,
+    payloads: Payloads,
+    /// Failures that the driver itself found, to be told to the machine in the next turn.
+    found: Vec<Event>,
+    registered: Option<oneshot::Sender<NodeId>>,
+    end: Option<End>,
+    /// Accepting and reconnecting; aborted with the driver.
+    tasks: JoinSet<()>,
+}
+
+/// Runs until drained, refused or dropped.
+pub(crate) async fn drive(setup: Setup) -> End {
+    let Setup { options, config, devices, mut events, server, session, inputs, mut received, registered } =
+        setup;
+    let mut driver = Driver {
+        machine: WorkerMachine::new(config),
+        origin: Instant::now(),
+        contents: ContentCache::new(options.content_cache_bytes),
+        options,
+        inputs: inputs.clone(),
+        coordinator: None,
+        serial: 0,
+        links: HashMap::new(),
+        devices: devices.into_iter().map(Device::new).collect(),
+        fetching: HashMap::new(),
+        payloads: Payloads::default(),
+        found: Vec::new(),
+        registered: Some(registered),
+        end: None,
+        tasks: JoinSet::new(),
+    };
+    driver.tasks.spawn(link::accept(Arc::clone(&server), inputs));
+    driver.connected(session);
+    let mut taken = Vec::with_capacity(INPUTS_PER_TURN);
+    let mut heard = Vec::with_capacity(INPUTS_PER_TURN);
+    let end = loop {
+        driver.carry_out(&mut events);
+        if let Some(end) = driver.end.take() {
+            break end;
+        }
+        let wake = driver.next_wake();
+        tokio::select! {
+            _ = received.recv_many(&mut taken, INPUTS_PER_TURN) => {}
+            _ = events.recv_many(&mut heard, INPUTS_PER_TURN) => {}
+            () = tokio::time::sleep_until(wake.unwrap_or_else(Instant::now).into()), if wake.is_some() => {}
+        }
+        for input in taken.drain(..) {
+            driver.take(input);
+        }
+        for event in heard.drain(..) {
+            driver.heard(event);
+        }
+        driver.act_on_timers();
+    };
+    driver.coordinator = None;
+    for (_, outbox) in driver.links.drain() {
+        outbox.close("the node leaves");
+    }
+    server.shutdown("the node leaves").await;
+    end
+}
+
+impl Driver {
+    fn now(&self) -> time::Instant {
+        time::Instant::ZERO.after(self.origin.elapsed())
+    }
+
+    fn tell(&mut self, event: Event) {
+        self.machine.handle(self.now(), event);
+    }
+
+    fn next_wake(&self) -> Option<Instant> {
+        self.machine.poll_timeout().map(|at| self.origin + at.since(time::Instant::ZERO))
+    }
+
+    fn act_on_timers(&mut self) {
+        let now = self.now();
+        if self.machine.poll_timeout().is_some_and(|at| at <= now) {
+            self.machine.handle_timeout(now);
+        }
+    }
+
+    fn take(&mut self, input: Input) {
+        match input {
+            Input::Connected(session) => self.connected(session),
+            Input::CoordinatorSaid { serial, message } if serial == self.serial => {
+                self.coordinator_said(message)
+            }
+            Input::CoordinatorEnded { serial, error } if serial == self.serial => {
+                self.coordinator_lost(&error)
+            }
+            Input::CoordinatorSaid { .. } | Input::CoordinatorEnded { .. } => {}
+            Input::LinkOpened { link, sender } => {
+                self.links.insert(link, Outbox::new(sender));
+            }
+            Input::AppSaid { link, frames } => {
+                for frame in frames {
+                    self.app_said(link, frame);
+                }
+            }
+            Input::LinkEnded { link } => {
+                self.links.remove(&link);
+                self.tell(Event::AppLinkClosed { link });
+            }
+            Input::Fetched { content, result } => self.fetched(content, result),
+            Input::Drain => self.tell(Event::DrainRequested),
+        }
+    }
+
+    fn connected(&mut self, session: NodeLink) {
+        self.serial += 1;
+        self.coordinator = Some(session.sender);
+        self.tasks.spawn(session::listen(self.serial, session.receiver, self.inputs.clone()));
+        self.tell(Event::CoordinatorConnected);
+    }
+
+    fn coordinator_said(&mut self, message: CoordinatorToNode) {
+        match &message {
+            CoordinatorToNode::Refused { reason } => {
+                tracing::error!(reason, "refused by the coordinator");
+                self.end = Some(End::Refused { reason: reason.clone() });
+            }
+            CoordinatorToNode::Welcome { node, epoch, .. } => {
+                tracing::info!(%node, %epoch, "registered");
+                if let Some(registered) = self.registered.take() {
+                    // Whoever started us may have given up; we are dropped then.
+                    let _ = registered.send(*node);
+                }
+            }
+            CoordinatorToNode::AppJoined { .. }
+            | CoordinatorToNode::AppLeft { .. }
+            | CoordinatorToNode::Cancel { .. }
+            | CoordinatorToNode::Drain
+            | CoordinatorToNode::HeartbeatAck { .. } => {}
+        }
+        self.tell(Event::FromCoordinator(message));
+    }
+
+    fn coordinator_lost(&mut self, error: &SessionError) {
+        tracing::warn!(%error, "the coordinator is lost; work goes on, trying again");
+        self.coordinator = None;
+        self.serial += 1;
+        self.tell(Event::CoordinatorLost);
+        self.tasks.spawn(session::again(self.options.coordinator.clone(), self.inputs.clone()));
+        // Ended tasks of earlier sessions.
+        while self.tasks.try_join_next().is_some() {}
+    }
+
+    fn app_said(&mut self, link: LinkId, frame: Frame<AppToNode>) {
+        if let AppToNode::Jobs(tickets) = &frame.header {
+            match codec::unpack_programs(frame.payload, tickets.len()) {
+                Ok(programs) => {
+                    for (ticket, program) in tickets.iter().zip(programs) {
+                        self.payloads.keep_program(ticket.job, program);
+                    }
+                }
+                Err(error) => {
+                    tracing::warn!(%link, %error, "an application broke the protocol");
+                    if let Some(outbox) = self.links.remove(&link) {
+                        outbox.sender().close("broken job frame");
+                    }
+                    self.tell(Event::AppLinkClosed { link });
+                    return;
+                }
+            }
+        }
+        self.tell(Event::FromApp { link, message: frame.header });
+    }
+
+    fn heard(&mut self, DeviceEvent { device, what }: DeviceEvent) {
+        match what {
+            DeviceNews::Started(job) => self.tell(Event::Started { job, device }),
+            DeviceNews::Finished { job, device_time_ns, outcome } => {
+                if let Some(device) = self.devices.get_mut(usize::from(device.0)) {
+                    device.finished();
+                }
+                let outcome = outcome.map(|payload| {
+                    let lengths = payload.sections.iter().map(|section| section.len() as u64).collect();
+                    // An aborted job's program is forgotten; its result must not stay behind.
+                    if self.payloads.program(job).is_some() {
+                        self.payloads.keep_result(job, payload.sections);
+                    }
+                    (lengths, payload.digest)
+                });
+                self.tell(Event::Executed { job, device, device_time_ns, outcome });
+            }
+            DeviceNews::Lost(reason) => {
+                tracing::error!(%device, reason, "a device is lost");
+                self.tell(Event::DeviceLost { device, reason });
+            }
+        }
+    }
+
+    /// Carries effects out until there is none, with some of what simulated devices answer at once: a jobless device
+    /// need not wait for a turn of the task, and a flood of no-op jobs must not keep inputs waiting.
+    fn carry_out(&mut self, events: &mut mpsc::UnboundedReceiver<DeviceEvent>) {
+        let mut answers = 0;
+        loop {
+            while let Some(effect) = self.machine.poll_effect() {
+                self.act(effect);
+            }
+            if !self.found.is_empty() {
+                for event in std::mem::take(&mut self.found) {
+                    self.tell(event);
+                }
+                continue;
+            }
+            if answers == ANSWERS_PER_TURN {
+                return;
+            }
+            let Ok(event) = events.try_recv() else { return };
+            answers += 1;
+            self.heard(event);
+        }
+    }
+
+    fn act(&mut self, effect: Effect) {
+        match effect {
+            Effect::ToCoordinator(message) => self.send_to_coordinator(message),
+            Effect::ToApp { link, message } => {
+                let payload = match &message {
+                    NodeToApp::Result(header) => self.payloads.result(header.job),
+                    NodeToApp::Welcome { .. } | NodeToApp::Refused { .. } => Vec::new(),
+                };
+                if let Some(outbox) = self.links.get(&link) {
+                    outbox.send(message, payload);
+                }
+            }
+            Effect::CloseApp { link } => {
+                if let Some(outbox) = self.links.remove(&link) {
+                    outbox.close("closed by the node");
+                }
+            }
+            Effect::Fetch { content, link } => self.fetch(content, link),
+            Effect::Execute { job, device } => self.execute(job, device),
+            Effect::Abort { job, device } => {
+                if let Some(device) = self.devices.get_mut(usize::from(device.0)) {
+                    device.abort(job);
+                }
+            }
+            Effect::Discard(job) => self.payloads.discard(job),
+            Effect::Release(hash) => {
+                self.contents.release(hash);
+                if let Some(wanted) = self.fetching.get_mut(&hash) {
+                    *wanted = false;
+                }
+            }
+            Effect::Exit => self.end = Some(End::Drained),
+        }
+    }
+
+    fn send_to_coordinator(&mut self, message: NodeToCoordinator) {
+        let Some(coordinator) = &self.coordinator else { return };
+        if let Err(error) = coordinator.try_send(message) {
+            // A coordinator that does not read for QUEUED_MESSAGES messages is as good as lost; the next hello's
+            // inventory says what it missed.
+            self.coordinator_lost(&error);
+        }
+    }
+
+    fn fetch(&mut self, content: Content, link: LinkId) {
+        if self.contents.pin(content.hash) {
+            self.found.push(Event::ContentReady(content.hash));
+            return;
+        }
+        if self.fetching.insert(content.hash, true).is_some() {
+            return;
+        }
+        let Some(outbox) = self.links.get(&link) else {
+            self.fetching.remove(&content.hash);
+            let reason = "its application's link is over".to_owned();
+            self.found.push(Event::ContentFailed { content: content.hash, reason });
+            return;
+        };
+        let (sender, inputs) = (outbox.sender().clone(), self.inputs.clone());
+        tokio::spawn(async move {
+            let result = sender.fetch(content).await;
+            // Without a driver the worker has ended.
+            let _ = inputs.send(Input::Fetched { content, result }).await;
+        });
+    }
+
+    fn fetched(&mut self, content: Content, result: Result<Bytes, FetchError>) {
+        let wanted = self.fetching.remove(&content.hash).unwrap_or(false);
+        let failed = |reason: String| Event::ContentFailed { content: content.hash, reason };
+        let event = match result {
+            Ok(bytes) => match self.contents.insert(content.hash, bytes) {
+                Ok(()) => Event::ContentReady(content.hash),
+                Err(full) => failed(format!(
+                    "the content cache of {} B is full of contents in use ({} B)",
+                    full.cap_bytes, full.pinned_bytes
+                )),
+            },
+            Err(error) => failed(error.to_string()),
+        };
+        if wanted {
+            self.tell(event);
+        } else {
+            self.contents.release(content.hash);
+        }
+    }
+
+    fn execute(&mut self, job: JobAttempt, index: DeviceIndex) {
+        let program = match self.payloads.program(job) {
+            Some(bytes) => codec::decode_program(&bytes).map_err(|error| error.to_string()),
+            None => Err("the node has no program of this job".to_owned()),
+        };
+        match (program, self.devices.get_mut(usize::from(index.0))) {
+            (Ok(program), Some(device)) => {
+                let contents = named_contents(&program)
+                    .into_iter()
+                    .filter_map(|hash| Some((hash, self.contents.get(&hash)?)))
+                    .collect();
+                device.execute(device::order(job, program, contents, self.options.job_limit));
+            }
+            (program, _) => {
+                let reason = program.err().unwrap_or_else(|| format!("{index} does not exist"));
+                let outcome = Err(JobFailure::InvalidProgram(reason));
+                self.found.push(Event::Executed { job, device: index, device_time_ns: 0, outcome });
+            }
+        }
+    }
+}
+
+/// What a program names, each once.
+fn named_contents(program: &JobProgram) -> HashSet<ContentHash> {
+    program
+        .commands()
+        .iter()
+        .filter_map(|command| match command {
+            Command::TaskAllocation { content, .. } | Command::Function { module: content, .. } => {
+                Some(content.hash)
+            }
+            Command::Malloc { .. }
+            | Command::MemcpyHtoD { .. }
+            | Command::GlobalHtoD { .. }
+            | Command::Param { .. }
+            | Command::Launch { .. }
+            | Command::MemcpyDtoH { .. } => None,
+        })
+        .collect()
+}

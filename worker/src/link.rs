@@ -1,0 +1,126 @@
+//! Applications' links: accepting them, reading from them, and writing to them without ever waiting in the owner task.
+
+use std::{
+    collections::VecDeque,
+    sync::{Arc, Mutex, PoisonError},
+};
+
+use bytes::Bytes;
+use farm_core::{
+    id::LinkId,
+    message::{AppToNode, NodeToApp},
+};
+use proto::link::{ContentSource, DataServer, Frame, Link, LinkReceiver, LinkSender, TrySendError};
+use tokio::sync::mpsc;
+
+use crate::driver::Input;
+
+/// Frames taken from a link at once.
+const FRAMES_PER_READ: usize = 64;
+
+/// Accepts applications until the server shuts down.
+pub(crate) async fn accept(server: Arc<DataServer>, inputs: mpsc::Sender<Input>) {
+    let mut next = 0;
+    while let Some(incoming) = server.accept().await {
+        let link = LinkId(next);
+        next += 1;
+        let inputs = inputs.clone();
+        tokio::spawn(async move {
+            // Applications fetch nothing from nodes yet; peers will.
+            match incoming.establish(ContentSource::empty()).await {
+                Ok(Link { sender, receiver }) => read(link, sender, receiver, inputs).await,
+                Err(error) => tracing::debug!(%link, %error, "a link was not made"),
+            }
+        });
+    }
+}
+
+async fn read(
+    link: LinkId,
+    sender: LinkSender<NodeToApp>,
+    mut receiver: LinkReceiver<AppToNode>,
+    inputs: mpsc::Sender<Input>,
+) {
+    if inputs.send(Input::LinkOpened { link, sender }).await.is_err() {
+        return;
+    }
+    loop {
+        let mut frames: Vec<Frame<AppToNode>> = Vec::new();
+        let read = receiver.recv_many(&mut frames, FRAMES_PER_READ).await;
+        if let Err(error) = read {
+            tracing::debug!(%link, %error, "a link is over");
+            // Without a driver the worker has ended.
+            let _ = inputs.send(Input::LinkEnded { link }).await;
+            return;
+        }
+        if inputs.send(Input::AppSaid { link, frames }).await.is_err() {
+            return;
+        }
+    }
+}
+
+/// The writing side of a link: straight into its queue while that has room, else over a backlog that a task of its own
+/// works off in order.
+#[derive(Debug)]
+pub(crate) struct Outbox {
+    sender: LinkSender<NodeToApp>,
+    /// `Some` while frames wait. A lock, not messages: the forwarder must end and the owner must see that it ended in
+    /// one step, or a frame could be left behind. Held for a push or a pop. At most one result of each job held
+    /// waits here (`MAX_JOBS`).
+    backlog: Arc<Mutex<Option<VecDeque<(NodeToApp, Vec<Bytes>)>>>>,
+}
+
+impl Outbox {
+    pub(crate) fn new(sender: LinkSender<NodeToApp>) -> Self {
+        Self { sender, backlog: Arc::new(Mutex::new(None)) }
+    }
+
+    /// The link, for fetching.
+    pub(crate) const fn sender(&self) -> &LinkSender<NodeToApp> {
+        &self.sender
+    }
+
+    /// Sends a frame, now or later. A link that is over drops it: what counts is sent again on the next link.
+    pub(crate) fn send(&self, header: NodeToApp, payload: Vec<Bytes>) {
+        let mut backlog = self.backlog.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(waiting) = backlog.as_mut() {
+            waiting.push_back((header, payload));
+            return;
+        }
+        match self.sender.try_send(header, payload) {
+            Ok(()) => {}
+            Err(TrySendError::Full(header, payload)) => {
+                *backlog = Some(VecDeque::from([(header, payload)]));
+                tokio::spawn(forward(self.sender.clone(), Arc::clone(&self.backlog)));
+            }
+            Err(TrySendError::Link(error)) => tracing::debug!(%error, "a frame was dropped with its link"),
+        }
+    }
+
+    /// Closes the link once everything is sent.
+    pub(crate) fn close(self, reason: &'static str) {
+        tokio::spawn(async move { self.sender.close_after_sent(reason).await });
+    }
+}
+
+async fn forward(
+    sender: LinkSender<NodeToApp>,
+    backlog: Arc<Mutex<Option<VecDeque<(NodeToApp, Vec<Bytes>)>>>>,
+) {
+    loop {
+        let next = {
+            let mut backlog = backlog.lock().unwrap_or_else(PoisonError::into_inner);
+            let next = backlog.as_mut().and_then(VecDeque::pop_front);
+            if next.is_none() {
+                *backlog = None;
+            }
+            next
+        };
+        let Some((header, payload)) = next else { return };
+        if let Err(error) = sender.send(header, payload).await {
+            tracing::debug!(%error, "frames were dropped with their link");
+            backlog.lock().unwrap_or_else(PoisonError::into_inner).take();
+            return;
+        }
+    }
+}
