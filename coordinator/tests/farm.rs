@@ -153,7 +153,8 @@ async fn who_speaks_another_protocol_is_told_why() {
 #[tokio::test]
 async fn a_malformed_message_ends_the_session_by_field() {
     let (_handle, address) = farm().await;
-    let mut client = v1::apps_client::AppsClient::connect(format!("http://{address}")).await.unwrap();
+    let channel = tonic::transport::Endpoint::from_shared(format!("http://{address}")).unwrap();
+    let mut client = v1::apps_client::AppsClient::new(channel.connect().await.unwrap());
     let hello = v1::AppHello { protocol: PROTOCOL_VERSION, name: "a".to_owned(), weight: -1.0, resume: None };
     let hello = v1::AppToCoordinator { message: Some(v1::app_to_coordinator::Message::Hello(hello)) };
     let outgoing = tokio_stream::once(hello).chain(tokio_stream::pending());
