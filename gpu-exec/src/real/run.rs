@@ -13,7 +13,7 @@ use std::{
 };
 
 use bytes::Bytes;
-use farm_core::{id::JobAttempt, message::JobFailure};
+use farm_core::{device::DeviceKind, id::JobAttempt, message::JobFailure};
 
 use super::{
     adapter::Gpu,
@@ -22,8 +22,11 @@ use super::{
     prepare::{Caches, Held, Launch, Prepared, Step},
 };
 
-/// Submits on the way at once: one runs, one is next without a gap, one is being recorded.
+/// Submits on the way at once on a GPU: one runs, one is next without a gap, one is being recorded.
 const MAX_IN_FLIGHT: usize = 3;
+/// On a software adapter: lavapipe (Mesa 22.3) blocks in a submit until the one before it has run, and with it the thread
+/// that has to keep the limits.
+const MAX_IN_FLIGHT_CPU: usize = 1;
 /// How long submits on the way may still take after the job is to end; a device that needs longer counts as hung.
 const GRACE: Duration = Duration::from_secs(2);
 
@@ -94,9 +97,15 @@ impl Run {
         self.in_flight.is_empty() && (self.steps.is_empty() || self.ending.is_some())
     }
 
+    /// Whether submits for other jobs would not block: see [`MAX_IN_FLIGHT_CPU`].
+    pub(crate) fn leaves_the_queue_free(&self, gpu: &Gpu) -> bool {
+        gpu.kind == DeviceKind::Gpu || self.in_flight.is_empty()
+    }
+
     /// Submits as much as may be on the way at once.
     pub(crate) fn fill(&mut self, gpu: &Gpu, timestamps: &mut TimestampPool, target: Duration) {
-        while self.ending.is_none() && !self.steps.is_empty() && self.in_flight.len() < MAX_IN_FLIGHT {
+        let most = if gpu.kind == DeviceKind::Gpu { MAX_IN_FLIGHT } else { MAX_IN_FLIGHT_CPU };
+        while self.ending.is_none() && !self.steps.is_empty() && self.in_flight.len() < most {
             let command = self.next_command();
             match gpu.scoped(|| self.submit(gpu, timestamps, target)) {
                 Ok(submitted) => self.in_flight.push_back(submitted),

@@ -118,8 +118,8 @@ impl DeviceThread {
             if let Err(RecvError) = self.take_messages() {
                 return Fault::Closed;
             }
-            self.submit();
             self.prepare_next();
+            self.submit();
             if let Some(running) = &mut self.state.running
                 && let Err(hung) = running.wait(&self.state.gpu, &mut self.state.timestamps, WAIT_SLICE)
             {
@@ -174,7 +174,10 @@ impl DeviceThread {
 
     /// Prepares a waiting order, if there is room: the device is free, or one only runs.
     fn prepare_next(&mut self) {
-        while self.state.staged.is_none() && !self.state.waiting.is_empty() {
+        let queue_free = |state: &State| {
+            state.running.as_ref().is_none_or(|running| running.leaves_the_queue_free(&state.gpu))
+        };
+        while self.state.staged.is_none() && !self.state.waiting.is_empty() && queue_free(&self.state) {
             let order = self.state.waiting.remove(0);
             let job = order.job;
             // A panic in here is the order's: it must not come back.

@@ -72,7 +72,8 @@ fn modules_that_do_not_compile_say_where() {
     );
     assert_names(&fail(&[0xff, 0xfe, 0]), &["command 0", "UTF-8"]);
     assert_names(&fail(&vec![b' '; (1 << 20) + 1]), &["command 0", "over 1048576 B"]);
-    assert_names(&fail(b""), &["command 0", "no @compute entry point `main`"]);
+    assert_names(&fail(b"const x = 1;"), &["command 0", "no @compute entry point `main`"]);
+    assert_names(&fail(b""), &["command 0", "a module of 0 B"]);
     let nested = format!("const x = {}1{};", "(".repeat(100_000), ")".repeat(100_000));
     assert_names(&fail(nested.as_bytes()), &["command 0"]);
     assert_alive(&device);
@@ -91,7 +92,7 @@ fn entry_points_and_constants_have_to_exist() {
     launch(&mut program, kernel);
     assert_names(&device.invalid(program, std::slice::from_ref(&module_bytes)), &["command 0", "`size`"]);
 
-    for count in [1e6, -1.0, 0.5, f64::NAN, 0.0] {
+    for count in [1e6, -1.0, 0.5, 0.0] {
         let mut program = JobProgram::default();
         let kernel = program.function_with_constants(module, "wide", &[("count", count)]);
         launch(&mut program, kernel);
@@ -119,13 +120,13 @@ fn globals_have_to_exist_to_fit_and_to_be_set() {
     assert_names(&device.invalid(program, &contents), &["command 3", "`camera` was never set"]);
     for (global, entry) in [("index", "plain"), ("camera", "sized"), ("out", "store")] {
         let (program, contents) = one_kernel(entry, |program, kernel| {
-            let out = program.malloc(16).unwrap();
+            let (out, input) = (program.malloc(16).unwrap(), program.malloc(16).unwrap());
             program.param_in_out(kernel, 0, out).unwrap();
-            program.param_in(kernel, 1, out).unwrap();
+            program.param_in(kernel, 1, input).unwrap();
             let slicing = Slicing { global: global.to_owned(), max_groups_z: 1 };
             program.launch_sliced(kernel, [1, 1, 4], slicing, CostNs(0)).unwrap();
         });
-        assert_names(&device.invalid(program, &contents), &["command 4", "slicing global", global]);
+        assert_names(&device.invalid(program, &contents), &["command 5", "slicing global", global]);
     }
     assert_alive(&device);
 }

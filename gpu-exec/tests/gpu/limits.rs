@@ -12,36 +12,29 @@ use gpu_exec::{Busy, ExecutorEvent, Order};
 
 use crate::device::{TestDevice, content};
 
-/// `rounds` dependent multiplications in each of 64 invocations; bounded, and no compiler can shorten it.
+/// Dependent multiplications in each of 64 invocations a workgroup: bounded, and no compiler can shorten them.
+/// lavapipe ends every loop of an invocation after 65,535 rounds in all, so long work takes more workgroups, not rounds.
 const SPIN: &str = "
 @group(0) @binding(0) var<storage, read_write> out: array<u32>;
-@group(1) @binding(0) var<uniform> rounds: u32;
 @group(1) @binding(1) var<uniform> first_z: u32;
 @compute @workgroup_size(64) fn spin(@builtin(global_invocation_id) id: vec3u) {
-    var x = id.x + id.z + first_z;
-    for (var i = 0u; i < rounds; i++) { x = (x ^ (x >> 13u)) * 1664525u + i; }
-    atomic_free(id.x, x);
-}
-fn atomic_free(index: u32, x: u32) { if x == 12345u { out[index] = x; } }
-@compute @workgroup_size(64) fn spin_once(@builtin(global_invocation_id) id: vec3u) {
-    var x = id.x;
-    for (var i = 0u; i < rounds; i++) { x = (x ^ (x >> 13u)) * 1664525u + i; }
-    atomic_free(id.x, x);
+    var x = id.x + id.y + id.z + first_z;
+    for (var i = 0u; i < 60000u; i++) { x = (x ^ (x >> 13u)) * 1664525u + i; }
+    if x == 12345u { out[id.x % 64u] = x; }
 }";
 
-fn spin(rounds: u32, layers: Option<u32>) -> (JobProgram, Vec<(ContentHash, Bytes)>) {
+fn spin([x, y, z]: [u32; 3], sliced: bool) -> (JobProgram, Vec<(ContentHash, Bytes)>) {
     let (module, module_bytes) = content(SPIN.as_bytes());
     let mut program = JobProgram::default();
-    let kernel = program.function(module, if layers.is_some() { "spin" } else { "spin_once" });
+    let kernel = program.function(module, "spin");
     let out = program.malloc(256).unwrap();
     program.param_in_out(kernel, 0, out).unwrap();
-    program.memcpy_htod(kernel, "rounds", &rounds.to_le_bytes()).unwrap();
-    match layers {
-        Some(layers) => {
-            let slicing = Slicing { global: "first_z".to_owned(), max_groups_z: 16 };
-            program.launch_sliced(kernel, [1, 1, layers], slicing, CostNs(0)).unwrap();
-        }
-        None => program.launch(kernel, [1, 1, 1]).unwrap(),
+    if sliced {
+        let slicing = Slicing { global: "first_z".to_owned(), max_groups_z: 16 };
+        program.launch_sliced(kernel, [x, y, z], slicing, CostNs(0)).unwrap();
+    } else {
+        program.memcpy_htod(kernel, "first_z", &[0; 4]).unwrap();
+        program.launch(kernel, [x, y, z]).unwrap();
     }
     program.memcpy_dtoh(out, 0, 256).unwrap();
     (program, vec![module_bytes])
@@ -49,7 +42,7 @@ fn spin(rounds: u32, layers: Option<u32>) -> (JobProgram, Vec<(ContentHash, Byte
 
 /// A job that runs until it is aborted or its limit is reached: 65,535 layers of some milliseconds.
 fn endless(device: &TestDevice) -> Order {
-    let (program, contents) = spin(1_000_000, Some(65_535));
+    let (program, contents) = spin([64, 1, 65_535], true);
     device.order(program, &contents)
 }
 
@@ -117,7 +110,7 @@ fn a_job_past_its_limit_ends_and_the_device_goes_on() {
     let device = TestDevice::open();
     let order = Order { limit: Duration::from_millis(100), ..endless(&device) };
     assert_eq!(device.run(order), Err(JobFailure::Timeout));
-    let (program, contents) = spin(10, Some(4));
+    let (program, contents) = spin([1, 1, 4], true);
     assert!(device.run_program(program, &contents).is_ok(), "the device serves the next job");
 }
 
@@ -125,8 +118,7 @@ fn a_job_past_its_limit_ends_and_the_device_goes_on() {
 fn a_launch_that_cannot_be_cut_costs_the_device_and_only_its_own_job() {
     let device = TestDevice::open();
     // Calibrated to some five seconds: longer than the executor's patience after the limit, and still bounded.
-    let rounds = 2_000_000;
-    let (program, contents) = spin(rounds, None);
+    let (program, contents) = spin([256, 1, 1], false);
     let warm_up = device.order(program.clone(), &contents);
     device.run(warm_up).unwrap();
     let measured = device.order(program, &contents);
@@ -134,11 +126,11 @@ fn a_launch_that_cannot_be_cut_costs_the_device_and_only_its_own_job() {
     device.executor.submit(measured).unwrap();
     let (device_time_ns, _) = device.finished(job);
     let factor = 5_000_000_000 / device_time_ns.max(1);
-    let long = u32::try_from(u64::from(rounds) * factor).unwrap_or(u32::MAX);
+    let long = [256, u32::try_from(factor).unwrap().clamp(1, 65_535), 1];
 
-    let (program, contents) = spin(long, None);
+    let (program, contents) = spin(long, false);
     let hung = Order { limit: Duration::from_millis(50), ..device.order(program, &contents) };
-    let (program, contents) = spin(10, None);
+    let (program, contents) = spin([1, 1, 1], false);
     let staged = device.order(program, &contents);
     let jobs = [hung.job, staged.job];
     device.executor.submit(hung).unwrap();
@@ -146,6 +138,6 @@ fn a_launch_that_cannot_be_cut_costs_the_device_and_only_its_own_job() {
     assert_eq!(device.finished(jobs[0]).1, Err(JobFailure::Timeout));
     assert!(device.finished(jobs[1]).1.is_ok(), "the staged job ran on the new device");
     // As long again on the new device: the one left behind has ended before the process does.
-    let (program, contents) = spin(long, None);
+    let (program, contents) = spin(long, false);
     assert!(device.run_program(program, &contents).is_ok());
 }
