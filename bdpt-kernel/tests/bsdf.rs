@@ -1,4 +1,5 @@
 //! Scattering: densities, agreement of sample, eval and pdf, reciprocity, white furnace (50-bdpt.md section 6).
+#![allow(clippy::cast_possible_truncation, reason = "clamped cells of a histogram")]
 
 use std::f32::consts::PI;
 

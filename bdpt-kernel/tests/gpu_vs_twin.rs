@@ -1,5 +1,6 @@
 //! The kernels against their twins on the same inputs: integers bit for bit, floats by tolerance, with a counted cap on
 //! lanes that branched otherwise (80-testing.md).
+#![allow(clippy::unwrap_used, reason = "a test may")]
 
 mod boxes;
 mod device;
@@ -100,7 +101,7 @@ impl Draws {
 
 /// Lanes of which some component differs by more than `tolerance`, relative above 1.
 fn strays(got: &[Vec4], expected: &[Vec4], per_lane: usize, tolerance: f32) -> usize {
-    assert_eq!(got.len(), expected.len());
+    assert_eq!(got.len(), expected.len(), "as many vectors");
     let differs = |(a, b): (&Vec4, &Vec4)| {
         let scale = b.abs().max(Vec4::ONE);
         !((*a - *b).abs() / scale).cmple(Vec4::splat(tolerance)).all()

@@ -1,4 +1,5 @@
 //! The WGSL text is valid, and its structs, bindings and constants are those of the Rust side.
+#![allow(clippy::cast_possible_truncation, reason = "offsets in small structs")]
 
 use std::mem::{offset_of, size_of};
 

@@ -1,5 +1,6 @@
 //! The recursion against the definition: for random full paths, the balance heuristic's weights of all strategies by
 //! products of pdfs sum to 1 and equal the recursion's (50-bdpt.md section 6).
+#![allow(clippy::cast_possible_truncation, reason = "explicit pdfs are f64, the recursion is f32")]
 
 mod boxes;
 
@@ -136,7 +137,7 @@ impl Explicit<'_> {
     }
 
     /// pdf_area of surface `i` when the light subpath comes from the light's side.
-    fn from_light(&self, i: usize) -> f64 {
+    fn pdf_from_light(&self, i: usize) -> f64 {
         if i + 1 < self.scattering() {
             let from = self.surface(i + 1);
             return self.scatter_pdf(i + 1, self.to_light(i + 1), self.to_eye(i + 1))
@@ -156,7 +157,7 @@ impl Explicit<'_> {
     }
 
     /// pdf of vertex `i` when the eye subpath comes from the camera's side; `i = scattering()` is the light's point.
-    fn from_eye(&self, i: usize) -> f64 {
+    fn pdf_from_eye(&self, i: usize) -> f64 {
         if i == 0 {
             let eye = Vec3::from(self.scene.frame().eye);
             let pdf = f64::from(camera_pdf(self.scene, -self.to_eye(0)));
@@ -179,11 +180,11 @@ impl Explicit<'_> {
         if s >= 1 && (eye >= 1 && joined(eye - 1) || s >= 2 && joined(eye)) {
             return 0.0;
         }
-        let eye_side: f64 = (0..eye).map(|i| self.from_eye(i)).product();
+        let eye_side: f64 = (0..eye).map(|i| self.pdf_from_eye(i)).product();
         let light_side: f64 = if s == 0 {
             1.0
         } else {
-            self.light_pdf() * (eye..n).map(|i| self.from_light(i)).product::<f64>()
+            self.light_pdf() * (eye..n).map(|i| self.pdf_from_light(i)).product::<f64>()
         };
         let samples = if eye == 0 { f64::from(self.scene.frame().nl) } else { 1.0 };
         samples * eye_side * light_side

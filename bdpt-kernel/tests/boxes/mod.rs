@@ -46,7 +46,7 @@ impl Builder {
     pub(crate) fn material(&mut self, bsdf: Bsdf, emission: Vec3) -> u32 {
         let index = self.materials.len();
         self.materials.push(Material { name: format!("material {index}"), bsdf, emission });
-        u32::try_from(index).unwrap()
+        u32::try_from(index).expect("a handful of materials")
     }
 
     pub(crate) fn triangle(&mut self, positions: [Vec3; 3], normals: [Vec3; 3], material: u32) {
