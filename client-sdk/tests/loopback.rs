@@ -1,0 +1,420 @@
+//! The SDK against an embedded farm of simulated devices: real coordinator, real workers, real gRPC and QUIC on loopback.
+
+use std::{
+    collections::BTreeSet,
+    net::{Ipv4Addr, TcpListener},
+    sync::{Arc, Mutex},
+    time::Duration,
+};
+
+use client_sdk::{
+    Content, CostNs, DispatchError, Farm, FarmError, FarmOptions, Job, JobFailure, JobProgram, JobResult,
+    Requirements, RetrieveError, Task, TaskData, TaskError, TaskGraph, TaskProgress, WaitReason, Window,
+};
+use coordinator::{CoordinatorHandle, CoordinatorOptions};
+use worker::{WorkerHandle, WorkerOptions};
+
+/// A coordinator and its workers.
+struct TestFarm {
+    coordinator: CoordinatorHandle,
+    workers: Vec<WorkerHandle>,
+}
+
+impl TestFarm {
+    async fn start(workers: usize, devices: &[&str]) -> Self {
+        let coordinator = coordinator::start(CoordinatorOptions::embedded()).await.unwrap();
+        let mut farm = Self { coordinator, workers: Vec::new() };
+        for _ in 0..workers {
+            farm.add_worker(devices, |options| options).await;
+        }
+        farm
+    }
+
+    async fn add_worker(&mut self, devices: &[&str], change: impl FnOnce(WorkerOptions) -> WorkerOptions) {
+        let specs = devices.iter().map(|device| device.parse().unwrap()).collect();
+        let name = format!("worker-{}", self.workers.len());
+        let options = WorkerOptions { name, ..WorkerOptions::embedded(self.address(), specs) };
+        self.workers.push(worker::start(change(options)).await.unwrap());
+    }
+
+    /// One node of two simulated devices.
+    async fn simulated() -> Self {
+        Self::start(1, &["sim", "sim"]).await
+    }
+
+    fn address(&self) -> String {
+        self.coordinator.grpc_addr().to_string()
+    }
+
+    fn options(&self) -> FarmOptions {
+        FarmOptions::new(self.address(), "loopback test")
+    }
+
+    async fn connect(&self) -> Farm {
+        Farm::connect(self.options()).await.unwrap()
+    }
+
+    async fn stop(self) {
+        for worker in self.workers {
+            worker.drain().await;
+        }
+        self.coordinator.shutdown().await;
+    }
+}
+
+/// What the jobs of a test brought back, in order of arrival.
+type Brought = Arc<Mutex<Vec<u32>>>;
+
+/// Uploads its number and takes it back; a simulated device keeps bytes and computes nothing.
+struct Echo {
+    number: u32,
+    cost: CostNs,
+    content: Option<Content>,
+    brought: Brought,
+    refuse: bool,
+}
+
+impl Job for Echo {
+    fn dispatch(&mut self, cmd: &mut JobProgram) -> Result<(), DispatchError> {
+        let buffer = cmd.malloc(8)?;
+        cmd.memcpy_htod_buffer(buffer, 4, &self.number.to_le_bytes())?;
+        if let Some(module) = self.content {
+            let kernel = cmd.function(module, "main");
+            cmd.launch_with_cost(kernel, [1, 1, 1], self.cost)?;
+        }
+        cmd.memcpy_dtoh(buffer, 4, 4)?;
+        cmd.memcpy_dtoh(buffer, 0, 8)
+    }
+
+    fn retrieve(&mut self, result: JobResult) -> Result<(), RetrieveError> {
+        let number = result.section(0, 4)?;
+        assert_eq!(&result.section(1, 8)?[4..], &number[..], "both copies are of one buffer");
+        if self.refuse {
+            return Err(RetrieveError::application("refused by the test"));
+        }
+        self.brought.lock().unwrap().push(u32::from_le_bytes([number[0], number[1], number[2], number[3]]));
+        Ok(())
+    }
+}
+
+/// Echo jobs, `chain` of which follow one after the other.
+#[derive(Default)]
+struct Echoes {
+    jobs: u32,
+    chain: u32,
+    cost: CostNs,
+    /// Bytes of a module that every job names.
+    module: Option<Vec<u8>>,
+    content: Option<Content>,
+    brought: Brought,
+    refuse: Option<u32>,
+    real: bool,
+}
+
+impl Echoes {
+    fn job(&self, number: u32) -> Box<dyn Job> {
+        let brought = Arc::clone(&self.brought);
+        let refuse = self.refuse == Some(number);
+        Box::new(Echo { number, cost: self.cost, content: self.content, brought, refuse })
+    }
+}
+
+impl Task for Echoes {
+    fn prepare(&mut self, data: &mut TaskData) -> Result<(), TaskError> {
+        self.content = self.module.take().map(|bytes| data.module(bytes));
+        Ok(())
+    }
+
+    fn requirements(&self) -> Requirements {
+        if self.real { Requirements::ANY_REAL } else { Requirements::ANY }
+    }
+
+    fn jobs(&mut self) -> Vec<Box<dyn Job>> {
+        (0..self.jobs).map(|number| self.job(number)).collect()
+    }
+
+    fn more_jobs(&mut self, progress: &TaskProgress) -> Vec<Box<dyn Job>> {
+        if self.chain == 0 || !progress.is_idle() {
+            return Vec::new();
+        }
+        self.chain -= 1;
+        vec![self.job(u32::try_from(progress.jobs_known).unwrap())]
+    }
+}
+
+/// Longer than any test.
+const HOUR: CostNs = CostNs(3_600_000_000_000);
+
+fn module() -> Option<Vec<u8>> {
+    Some(b"@compute @workgroup_size(1) fn main() {}".to_vec())
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn every_job_comes_back_once() {
+    let farm = TestFarm::simulated().await;
+    // A window far smaller than the jobs, so that it moves.
+    let window = Window { jobs: 200, ..Window::default() };
+    let app = Farm::connect(FarmOptions { window, ..farm.options() }).await.unwrap();
+    let brought = Brought::default();
+    let task = Echoes { jobs: 3_000, module: module(), brought: Arc::clone(&brought), ..Echoes::default() };
+    let progress = app.progress();
+    let summary = app.run(TaskGraph::new().task("echo", task)).await.unwrap();
+    assert_eq!((summary.jobs, summary.tasks[0].jobs, summary.replanned), (3_000, 3_000, 0));
+    let brought = brought.lock().unwrap().clone();
+    assert_eq!(brought.len(), 3_000, "none twice");
+    assert_eq!(brought.into_iter().collect::<BTreeSet<_>>(), (0..3_000).collect(), "none missing");
+    let last = progress.borrow().clone();
+    assert_eq!((last.jobs_done, last.jobs_known, last.nodes, last.waiting), (3_000, 3_000, 1, None));
+    app.close().await;
+    farm.stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_small_window_and_little_room_for_results_lose_nothing() {
+    let farm = TestFarm::simulated().await;
+    let window = Window { jobs: 7, program_bytes: 1, result_bytes: 1 };
+    let app = Farm::connect(FarmOptions { window, ..farm.options() }).await.unwrap();
+    let brought = Brought::default();
+    let task = Echoes { jobs: 50, brought: Arc::clone(&brought), ..Echoes::default() };
+    assert_eq!(app.run(TaskGraph::new().task("echo", task)).await.unwrap().jobs, 50);
+    assert_eq!(brought.lock().unwrap().len(), 50);
+    app.close().await;
+    farm.stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn jobs_follow_their_results_and_tasks_their_graph() {
+    let farm = TestFarm::simulated().await;
+    let app = farm.connect().await;
+    let brought = Brought::default();
+    let first =
+        Echoes { jobs: 1, chain: 20, module: module(), brought: Arc::clone(&brought), ..Echoes::default() };
+    let second = Echoes { jobs: 1, brought: Arc::clone(&brought), ..Echoes::default() };
+    let graph = TaskGraph::new().task("second", second).task("first", first).after("second", "first");
+    let summary = app.run(graph).await.unwrap();
+    assert_eq!((summary.tasks[0].jobs, summary.tasks[1].jobs), (1, 21));
+    let expected: Vec<u32> = (0..21).chain([0]).collect();
+    assert_eq!(*brought.lock().unwrap(), expected, "the second task begins when the first is done");
+    app.close().await;
+    farm.stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn runs_go_side_by_side_and_an_error_ends_only_its_own() {
+    let farm = TestFarm::simulated().await;
+    let app = farm.connect().await;
+    let bad = Echoes { jobs: 100, refuse: Some(3), ..Echoes::default() };
+    let good = Echoes { jobs: 500, ..Echoes::default() };
+    let (bad, good) = tokio::join!(
+        app.run(TaskGraph::new().task("bad", bad)),
+        app.run(TaskGraph::new().task("good", good)),
+    );
+    assert_eq!(bad.unwrap_err().to_string(), "task `bad`, job-3, retrieve: refused by the test");
+    assert_eq!(good.unwrap().jobs, 500);
+    let after = Echoes { jobs: 5, ..Echoes::default() };
+    assert_eq!(
+        app.run(TaskGraph::new().task("after", after)).await.unwrap().jobs,
+        5,
+        "the farm is still of use"
+    );
+    app.close().await;
+    farm.stop().await;
+}
+
+/// Hears of its failure, like every job that ends without a result.
+struct Endless {
+    module: Option<Content>,
+    failures: Arc<Mutex<Vec<String>>>,
+}
+
+impl Job for Endless {
+    fn dispatch(&mut self, cmd: &mut JobProgram) -> Result<(), DispatchError> {
+        let kernel = cmd.function(self.module.expect("prepare comes first"), "main");
+        cmd.launch_with_cost(kernel, [1, 1, 1], HOUR)
+    }
+
+    fn retrieve(&mut self, _: JobResult) -> Result<(), RetrieveError> {
+        Err(RetrieveError::application("there cannot be a result"))
+    }
+
+    fn failed(&mut self, failure: &JobFailure) {
+        self.failures.lock().unwrap().push(format!("{failure:?}"));
+    }
+}
+
+#[derive(Default)]
+struct EndlessTask {
+    module: Option<Content>,
+    failures: Arc<Mutex<Vec<String>>>,
+}
+
+impl Task for EndlessTask {
+    fn prepare(&mut self, data: &mut TaskData) -> Result<(), TaskError> {
+        self.module = module().map(|text| data.module(text));
+        Ok(())
+    }
+
+    fn requirements(&self) -> Requirements {
+        Requirements::ANY
+    }
+
+    fn jobs(&mut self) -> Vec<Box<dyn Job>> {
+        vec![Box::new(Endless { module: self.module, failures: Arc::clone(&self.failures) })]
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_job_that_fails_everywhere_fails_the_run() {
+    let mut farm = TestFarm::start(0, &[]).await;
+    for _ in 0..2 {
+        farm.add_worker(&["sim"], |options| WorkerOptions {
+            job_limit: Duration::from_millis(20),
+            ..options
+        })
+        .await;
+    }
+    let app = farm.connect().await;
+    let task = EndlessTask::default();
+    let failures = Arc::clone(&task.failures);
+    let error = app.run(TaskGraph::new().task("endless", task)).await.unwrap_err();
+    assert!(matches!(&error, FarmError::JobFailed { task, .. } if task == "endless"), "{error}");
+    assert_eq!(failures.lock().unwrap().len(), 1, "the job hears it once: {failures:?}");
+    app.close().await;
+    farm.stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn jobs_of_a_node_that_vanishes_run_elsewhere() {
+    let mut farm = TestFarm::start(1, &["sim:speed=0.001"]).await;
+    let app = farm.connect().await;
+    let brought = Brought::default();
+    // 1 ms of work is 1 s on the slow node: it holds most jobs when it goes.
+    let cost = CostNs(1_000_000);
+    let task =
+        Echoes { jobs: 200, cost, module: module(), brought: Arc::clone(&brought), ..Echoes::default() };
+    let mut progress = app.progress();
+    let change_nodes = async {
+        progress.wait_for(|progress| progress.nodes == 1).await.unwrap();
+        let slow = farm.workers.remove(0);
+        farm.add_worker(&["sim"], |options| WorkerOptions { name: "late".to_owned(), ..options }).await;
+        drop(slow);
+    };
+    let (outcome, ()) = tokio::join!(app.run(TaskGraph::new().task("echo", task)), change_nodes);
+    let summary = outcome.unwrap();
+    assert_eq!(summary.jobs, 200);
+    assert!(summary.replanned > 0, "{summary:?}");
+    assert_eq!(brought.lock().unwrap().iter().copied().collect::<BTreeSet<_>>(), (0..200).collect());
+    assert_eq!(brought.lock().unwrap().len(), 200);
+    app.close().await;
+    farm.stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn stopping_ends_a_run_in_order() {
+    let farm = TestFarm::simulated().await;
+    let app = farm.connect().await;
+    let brought = Brought::default();
+    // Four jobs of nothing, then jobs of an hour.
+    let quick = Echoes { jobs: 4, brought: Arc::clone(&brought), ..Echoes::default() };
+    let slow = Echoes { jobs: 10, cost: HOUR, module: module(), ..Echoes::default() };
+    let graph = TaskGraph::new().task("quick", quick).task("slow", slow).after("slow", "quick");
+    let (stop, mut progress) = (app.stop_handle(), app.progress());
+    let stop_when_under_way = async {
+        progress.wait_for(|progress| progress.jobs_done == 4 && progress.jobs_known == 14).await.unwrap();
+        stop.stop();
+    };
+    let (outcome, ()) = tokio::join!(app.run(graph), stop_when_under_way);
+    let error = outcome.unwrap_err();
+    assert!(matches!(error, FarmError::Stopped { jobs_done: 4, jobs_known: 14 }), "{error}");
+    assert_eq!(brought.lock().unwrap().len(), 4);
+    app.close().await;
+    // The devices are free again: a drained worker ends without waiting an hour.
+    farm.stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn waiting_for_a_device_is_said_and_bounded() {
+    let farm = TestFarm::simulated().await;
+    let app =
+        Farm::connect(FarmOptions { patience: Duration::from_millis(300), ..farm.options() }).await.unwrap();
+    let mut progress = app.progress();
+    let said = async { progress.wait_for(|progress| progress.waiting.is_some()).await.unwrap().waiting };
+    let real = Echoes { jobs: 3, real: true, ..Echoes::default() };
+    let (outcome, said) = tokio::join!(app.run(TaskGraph::new().task("real", real)), said);
+    assert_eq!(said, Some(WaitReason::NoFittingDevice));
+    let error = outcome.unwrap_err();
+    assert!(matches!(&error, FarmError::NoFittingDevice { task, .. } if task == "real"), "{error}");
+    assert!(error.can_be_retried());
+    app.close().await;
+    farm.stop().await;
+
+    let empty = TestFarm::start(0, &[]).await;
+    let app =
+        Farm::connect(FarmOptions { patience: Duration::from_millis(300), ..empty.options() }).await.unwrap();
+    let task = Echoes { jobs: 1, ..Echoes::default() };
+    let error = app.run(TaskGraph::new().task("any", task)).await.unwrap_err();
+    assert!(matches!(error, FarmError::NoFittingDevice { reason: WaitReason::NoNode, .. }), "{error}");
+    app.close().await;
+    empty.stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn an_absent_coordinator_is_named() {
+    // A port that was free a moment ago: nobody listens there.
+    let free = TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).unwrap().local_addr().unwrap().to_string();
+    let error = Farm::connect(FarmOptions::new(&free, "test")).await.unwrap_err();
+    assert!(matches!(&error, FarmError::Unreachable { address, .. } if *address == free), "{error}");
+
+    // One that takes connections and says nothing.
+    let mute = TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).unwrap();
+    let address = mute.local_addr().unwrap().to_string();
+    let options =
+        FarmOptions { connect_timeout: Duration::from_millis(300), ..FarmOptions::new(&address, "test") };
+    let error = Farm::connect(options).await.unwrap_err();
+    assert!(matches!(&error, FarmError::Unreachable { address: named, .. } if *named == address), "{error}");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_lost_coordinator_ends_the_run_after_a_while() {
+    let farm = TestFarm::simulated().await;
+    let reconnect_timeout = Duration::from_millis(500);
+    let app = Farm::connect(FarmOptions { reconnect_timeout, ..farm.options() }).await.unwrap();
+    let slow = Echoes { jobs: 2, cost: HOUR, module: module(), ..Echoes::default() };
+    let mut progress = app.progress();
+    let TestFarm { coordinator, workers } = farm;
+    let lose_it = async {
+        progress.wait_for(|progress| progress.nodes == 1).await.unwrap();
+        coordinator.shutdown().await;
+    };
+    let (outcome, ()) = tokio::join!(app.run(TaskGraph::new().task("slow", slow)), lose_it);
+    let error = outcome.unwrap_err();
+    assert!(matches!(error, FarmError::CoordinatorLost { .. }), "{error}");
+    let again =
+        app.run(TaskGraph::new().task("again", Echoes { jobs: 1, ..Echoes::default() })).await.unwrap_err();
+    assert!(matches!(again, FarmError::CoordinatorLost { .. }), "a lost farm stays lost: {again}");
+    app.close().await;
+    drop(workers);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_dropped_run_and_a_closed_farm_leave_nothing_behind() {
+    let farm = TestFarm::simulated().await;
+    let app = farm.connect().await;
+    let slow = Echoes { jobs: 2, cost: HOUR, module: module(), ..Echoes::default() };
+    let mut progress = app.progress();
+    tokio::select! {
+        outcome = app.run(TaskGraph::new().task("slow", slow)) => panic!("an hour's job is done: {outcome:?}"),
+        _ = progress.wait_for(|progress| progress.nodes == 1) => {}
+    }
+    progress.wait_for(|progress| progress.active_tasks.is_empty()).await.unwrap();
+    let quick = Echoes { jobs: 10, ..Echoes::default() };
+    assert_eq!(
+        app.run(TaskGraph::new().task("quick", quick)).await.unwrap().jobs,
+        10,
+        "the devices are free again"
+    );
+    app.close().await;
+    let status = farm.coordinator.status().await.expect("the coordinator runs");
+    assert!(status.apps.is_empty(), "goodbye was said: {:?}", status.apps);
+    farm.stop().await;
+}
