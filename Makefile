@@ -6,9 +6,8 @@
 demo:
 	./deploy/setup.sh
 	cargo build --release --locked
-	./target/release/farmctl scene cornell demo/cornell
-	./target/release/farmctl render demo/cornell -o demo/cornell.png --size 256x256 --spp 64
-	./target/release/farmctl render demo/cornell -o demo/cornell.exr --size 256x256 --spp 64
+	test -e demo/cornell/scene.toml || ./target/release/farmctl scene cornell-box demo/cornell
+	./target/release/farmctl render demo/cornell -o demo/cornell.png -o demo/cornell.exr --size 256x256 --spp 64
 	@echo "look at demo/cornell.png and demo/cornell.exr"
 
 build:

@@ -103,7 +103,7 @@ for service in coordinator worker-1 worker-2 worker-3; do
 done
 say "healthy"
 
-"$farmctl" scene cornell "$work/cornell" >/dev/null
+"$farmctl" scene cornell-box "$work/cornell" >/dev/null
 render() { timeout "$render_patience_s" "$farmctl" --coordinator "$coordinator" render "$work/cornell" -o "$1" "${render_flags[@]}" "${@:2}"; }
 
 render "$work/quiet.exr" --progress none || fail "the undisturbed render failed"

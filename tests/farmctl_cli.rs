@@ -113,7 +113,7 @@ fn bad_renders_name_the_place_and_leave_no_image() {
 fn an_unwritable_output_is_refused_before_rendering() {
     let folder = TempDir::new().expect("a temporary folder");
     let scene = folder.path().join("cornell").display().to_string();
-    assert!(farmctl(["scene", "cornell", &scene]).status.success(), "a scene is written");
+    assert!(farmctl(["scene", "cornell-box", &scene]).status.success(), "a scene is written");
     for output in ["/proc/nowhere/image.png", "/nonexistent-folder/image.exr"] {
         let done = farmctl(["render", &scene, "-o", output, "--spp", "100000"]);
         assert_eq!(done.status.code(), Some(1), "{}", text(&done.stderr));

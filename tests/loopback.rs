@@ -11,7 +11,7 @@ const RENDER: [&str; 6] = ["--size", "160x128", "--spp", "32", "--seed", "7"];
 
 fn cornell(folder: &TempDir) -> String {
     let scene = folder.path().join("cornell").display().to_string();
-    let made = farmctl(["scene", "cornell", &scene]);
+    let made = farmctl(["scene", "cornell-box", &scene]);
     assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
     scene
 }

@@ -1,1 +1,58 @@
-fn main() {}
+//! The one command line of Gleaner. Raw arguments become checked ones in `cli`, verbs are in `command`, output is a
+//! function of data in `output`.
+
+mod admin;
+mod bench;
+mod cli;
+mod command;
+mod embedded;
+mod failure;
+mod output;
+mod progress;
+
+use std::process::ExitCode;
+
+use clap::Parser;
+use tracing_subscriber::EnvFilter;
+
+use crate::{
+    cli::{Cli, Verb},
+    failure::Failure,
+};
+
+fn main() -> ExitCode {
+    let cli = Cli::parse();
+    // Logs are for the one who asks (RUST_LOG): a command's own words are its output and its error.
+    tracing_subscriber::fmt()
+        .with_env_filter(EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new("error")))
+        .with_writer(std::io::stderr)
+        .init();
+    match run(&cli) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(failure) => {
+            eprintln!("farmctl: {:#}", failure.error());
+            failure.exit_code()
+        }
+    }
+}
+
+fn run(cli: &Cli) -> Result<(), Failure> {
+    let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build()?;
+    let result = runtime.block_on(async {
+        let coordinator = cli.coordinator.as_deref();
+        match &cli.verb {
+            Verb::Up(arguments) => command::up::run(arguments).await,
+            Verb::Render(arguments) => Box::pin(command::render::run(arguments, coordinator)).await,
+            Verb::Scene(arguments) => command::scene::run(arguments),
+            Verb::Status(arguments) => command::status::run(arguments, coordinator, cli.output).await,
+            Verb::Node(verb) => command::node::run(verb, coordinator).await,
+            Verb::Bench(arguments) => {
+                Box::pin(bench::run(arguments.name, arguments.output.unwrap_or(cli.output))).await
+            }
+            Verb::Version => command::version::run(cli.output),
+        }
+    });
+    // A device thread or a name look-up may still hang: nothing of it is worth waiting for.
+    runtime.shutdown_background();
+    result
+}

@@ -1,0 +1,235 @@
+//! The command line as typed: raw arguments and their checks, no work.
+
+use std::{path::PathBuf, str::FromStr, time::Duration};
+
+use clap::{Args, Parser, Subcommand, ValueEnum};
+
+/// Gleaner: a GPU compute farm whose idle devices glean work from busy ones.
+#[derive(Debug, Parser)]
+#[command(name = "farmctl", version, disable_version_flag = false)]
+pub(crate) struct Cli {
+    /// The farm's coordinator; without one, `render` and `bench` start a farm of their own.
+    #[arg(long, env = "GLEANER_COORDINATOR", value_name = "HOST:PORT")]
+    pub coordinator: Option<String>,
+    /// How reads are printed.
+    #[arg(short = 'o', long, value_enum, default_value_t = Format::Table, id = "format")]
+    pub output: Format,
+    #[command(subcommand)]
+    pub verb: Verb,
+}
+
+/// How a read is printed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub(crate) enum Format {
+    /// Columns for people.
+    Table,
+    /// More columns.
+    Wide,
+    /// One JSON document.
+    Json,
+    /// One JSON document a line.
+    Ndjson,
+}
+
+#[derive(Debug, Subcommand)]
+pub(crate) enum Verb {
+    /// Run a whole farm in this process: coordinator and one worker over every device found.
+    Up(UpArgs),
+    /// Render a scene to an image.
+    Render(RenderArgs),
+    /// Write one of the shipped scenes into a folder.
+    Scene(SceneArgs),
+    /// Show the farm: nodes, devices, queues, applications.
+    Status(StatusArgs),
+    /// Look after nodes.
+    #[command(subcommand)]
+    Node(NodeVerb),
+    /// Measure the farm against its bars.
+    Bench(BenchArgs),
+    /// Print versions.
+    Version,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct UpArgs {
+    /// Address of the coordinator; port 0 lets the system choose.
+    #[arg(long, value_name = "HOST:PORT", default_value = "127.0.0.1:7700")]
+    pub listen: String,
+    /// Address of the status page and of /metrics.
+    #[arg(long, value_name = "HOST:PORT", default_value = "127.0.0.1:7701")]
+    pub http: String,
+    /// Devices of the worker: all, gpu:N, cpu, sim:score=1000,speed=1.0; repeatable.
+    #[arg(long = "device", value_name = "SPEC")]
+    pub devices: Vec<String>,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct RenderArgs {
+    /// A scene folder or its scene.toml.
+    pub scene: PathBuf,
+    /// Where the image goes: .exr (layers, linear) or .png (8 bit sRGB); repeatable.
+    #[arg(short = 'o', long = "output", value_name = "IMAGE", required = true, value_parser = image_path)]
+    pub images: Vec<PathBuf>,
+    /// Image size in pixels; the scene's own without it.
+    #[arg(long, value_name = "WxH")]
+    pub size: Option<Size>,
+    /// Samples per pixel.
+    #[arg(long, default_value_t = 64, value_parser = clap::value_parser!(u32).range(1..=1 << 24))]
+    pub spp: u32,
+    /// Same seed, same kind of device: same image, byte for byte.
+    #[arg(long, default_value_t = 1)]
+    pub seed: u64,
+    /// Brightness of the PNG in stops.
+    #[arg(long, default_value_t = 0.0, allow_negative_numbers = true)]
+    pub exposure: f32,
+    /// How progress is told.
+    #[arg(long, value_enum, default_value_t = ProgressStyle::Auto)]
+    pub progress: ProgressStyle,
+    /// Devices of the own farm when no coordinator is given; repeatable.
+    #[arg(long = "device", value_name = "SPEC")]
+    pub devices: Vec<String>,
+}
+
+/// How progress is told.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub(crate) enum ProgressStyle {
+    /// A bar on a terminal, nothing otherwise.
+    Auto,
+    /// A line of JSON on stdout at each step.
+    Ndjson,
+    /// Nothing.
+    None,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct SceneArgs {
+    /// Which scene; `farmctl scene list` names them.
+    pub name: String,
+    /// The folder to write; made if missing.
+    pub folder: Option<PathBuf>,
+    /// Size of the generated geometry, where the scene has one (triangles, roughly).
+    #[arg(long)]
+    pub triangles: Option<u32>,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct StatusArgs {
+    /// How it is printed (as before the verb).
+    #[arg(short = 'o', long, value_enum, id = "status_format")]
+    pub output: Option<Format>,
+    /// Print again every INTERVAL until interrupted.
+    #[arg(long, value_name = "INTERVAL", num_args = 0..=1, default_missing_value = "1s", value_parser = duration)]
+    pub watch: Option<Duration>,
+}
+
+#[derive(Debug, Subcommand)]
+pub(crate) enum NodeVerb {
+    /// Let a node finish what runs and leave; its queued jobs go elsewhere.
+    Drain {
+        /// The node's name or id.
+        node: String,
+    },
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct BenchArgs {
+    /// Which figures.
+    #[arg(value_enum)]
+    pub name: BenchName,
+    /// How they are printed (as before the verb).
+    #[arg(short = 'o', long, value_enum, id = "bench_format")]
+    pub output: Option<Format>,
+}
+
+/// A set of figures with their bars (10-scheduling.md section 5).
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub(crate) enum BenchName {
+    /// Round trip of a no-op job, jobs a second, CPU time a job.
+    Scheduler,
+}
+
+/// An image size in pixels, both extents positive.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct Size {
+    pub width_px: u32,
+    pub height_px: u32,
+}
+
+/// Largest extent of an image; the film of a square of it takes 16 GiB.
+const MAX_EXTENT_PX: u32 = 16_384;
+
+impl FromStr for Size {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let extents = text.split_once(['x', 'X']).and_then(|(width, height)| {
+            Some(Self { width_px: width.parse().ok()?, height_px: height.parse().ok()? })
+        });
+        match extents {
+            None => Err(format!("{text:?} is not WIDTHxHEIGHT, such as 640x360")),
+            Some(size)
+                if [size.width_px, size.height_px]
+                    .iter()
+                    .any(|&extent| extent == 0 || extent > MAX_EXTENT_PX) =>
+            {
+                Err(format!("{text}: width and height must be 1 to {MAX_EXTENT_PX} pixels"))
+            }
+            Some(size) => Ok(size),
+        }
+    }
+}
+
+fn image_path(text: &str) -> Result<PathBuf, String> {
+    let path = PathBuf::from(text);
+    let extension = path.extension().and_then(|extension| extension.to_str()).map(str::to_ascii_lowercase);
+    match extension.as_deref() {
+        Some("exr" | "png") => Ok(path),
+        _ => Err(format!("{text:?}: the image's name must end in .exr or .png")),
+    }
+}
+
+fn duration(text: &str) -> Result<Duration, String> {
+    let split = text.find(|c: char| !c.is_ascii_digit() && c != '.').unwrap_or(text.len());
+    let (number, unit) = text.split_at(split);
+    let seconds = match unit {
+        "ms" => 0.001,
+        "s" | "" => 1.0,
+        "m" => 60.0,
+        "h" => 3_600.0,
+        _ => return Err(format!("{text:?}: the unit must be ms, s, m or h")),
+    };
+    let number: f64 =
+        number.parse().map_err(|_| format!("{text:?} is not a duration, such as 500ms or 15m"))?;
+    Duration::try_from_secs_f64(number * seconds).map_err(|error| format!("{text:?}: {error}"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn sizes_are_checked() {
+        assert_eq!("640x360".parse(), Ok(Size { width_px: 640, height_px: 360 }));
+        for bad in ["", "640", "0x10", "10x0", "-1x4", "1e3x4", "99999x1"] {
+            assert!(bad.parse::<Size>().is_err(), "{bad}");
+        }
+    }
+
+    #[test]
+    fn durations_have_units() {
+        assert_eq!(duration("15m"), Ok(Duration::from_secs(900)));
+        assert_eq!(duration("500ms"), Ok(Duration::from_millis(500)));
+        for bad in ["", "x", "5d", "-1s", "1..2s"] {
+            assert!(duration(bad).is_err(), "{bad}");
+        }
+    }
+
+    #[test]
+    fn output_means_format_before_the_verb_and_image_after_render() {
+        let cli = Cli::try_parse_from(["farmctl", "-o", "json", "render", "s", "-o", "a.png", "-o", "b.exr"])
+            .unwrap();
+        assert_eq!(cli.output, Format::Json);
+        let Verb::Render(render) = cli.verb else { panic!("render was parsed as {:?}", cli.verb) };
+        assert_eq!(render.images, [PathBuf::from("a.png"), PathBuf::from("b.exr")]);
+    }
+}

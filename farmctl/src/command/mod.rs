@@ -1,0 +1,8 @@
+//! One file per verb: checked arguments in, work done through the libraries, a `Failure` or nothing out.
+
+pub(crate) mod node;
+pub(crate) mod render;
+pub(crate) mod scene;
+pub(crate) mod status;
+pub(crate) mod up;
+pub(crate) mod version;

@@ -1,0 +1,217 @@
+//! `farmctl render`: a scene folder in, images out, through a farm.
+
+use std::{path::Path, time::Duration};
+
+use anyhow::{Context as _, anyhow};
+use bdpt_kernel::{
+    film::Image,
+    job::{RenderHandle, RenderOptions, render_graph},
+    output::{self, Tone},
+    scene::{self, LoadedScene, model::FilmSize},
+};
+use client_sdk::{Farm, FarmError, FarmOptions, RunSummary, TaskGraph};
+use serde_json::json;
+use tokio::signal::unix::{Signal, SignalKind, signal};
+
+use crate::{
+    cli::{ProgressStyle, RenderArgs},
+    embedded::EmbeddedFarm,
+    failure::Failure,
+    output::print_text,
+    progress::{self, Units},
+};
+
+/// Renders; the exit code is 0 only when every image is complete.
+pub(crate) async fn run(arguments: &RenderArgs, coordinator: Option<&str>) -> Result<(), Failure> {
+    let mut stops = Stops::listen()?;
+    for image in &arguments.images {
+        output::check_writable(image)?;
+    }
+    let path = arguments.scene.clone();
+    // A signal ends the process's main task; a scene half loaded is not worth waiting for.
+    let loaded = tokio::select! {
+        loaded = tokio::task::spawn_blocking(move || scene::load(&path)) => loaded.context("loading panicked")??,
+        () = stops.recv() => return Err(anyhow!("interrupted while loading the scene: no image was written").into()),
+    };
+    report(&loaded);
+    let size = arguments
+        .size
+        .map_or(loaded.scene.film, |size| FilmSize { width_px: size.width_px, height_px: size.height_px });
+    let (graph, render) =
+        render_graph(loaded.scene, RenderOptions::new(size, arguments.spp, arguments.seed))?;
+
+    let own_farm = match coordinator {
+        Some(_) => None,
+        None => Some(tokio::select! {
+            farm = EmbeddedFarm::start(&arguments.devices) => farm?,
+            () = stops.recv() => return Err(anyhow!("interrupted before rendering: no image was written").into()),
+        }),
+    };
+    let address = own_farm.as_ref().map(EmbeddedFarm::grpc).or_else(|| coordinator.map(str::to_owned));
+    let address = address.expect("either a coordinator is given or the own farm was started");
+    let result = run_on(&address, graph, &render, arguments, &mut stops).await;
+    let ended = finish(result, &render, arguments).await;
+    if let Some(farm) = own_farm {
+        tokio::select! {
+            () = farm.stop() => {}
+            () = stops.recv() => {}
+        }
+    }
+    ended
+}
+
+/// Warnings of the loader, for the one who made the scene.
+fn report(loaded: &LoadedScene) {
+    for warning in &loaded.report.warnings {
+        eprintln!("farmctl: warning: {warning}");
+    }
+    if loaded.report.warnings_dropped > 0 {
+        eprintln!("farmctl: warning: {} further warnings", loaded.report.warnings_dropped);
+    }
+}
+
+/// Runs the graph on the farm at `address`; the first signal stops it in order, the second one ends the process.
+async fn run_on(
+    address: &str,
+    graph: TaskGraph,
+    render: &RenderHandle,
+    arguments: &RenderArgs,
+    stops: &mut Stops,
+) -> Result<RunSummary, FarmError> {
+    let farm = Farm::connect(FarmOptions::new(address, app_name(&arguments.scene))).await?;
+    let plan = render.plan();
+    #[expect(clippy::cast_precision_loss, reason = "a rate for people")]
+    let units = Units {
+        jobs: plan.tile_jobs() + u64::from(plan.light_jobs()),
+        total: plan.total_samples() as f64,
+        name: "samples",
+    };
+    let teller = tokio::spawn(progress::tell(farm.progress(), arguments.progress, units));
+    let stop = farm.stop_handle();
+    let result = {
+        let running = farm.run(graph);
+        tokio::pin!(running);
+        tokio::select! {
+            result = &mut running => result,
+            () = stops.recv() => {
+                eprintln!("farmctl: stopping; again to end at once");
+                stop.stop();
+                tokio::select! {
+                    result = &mut running => result,
+                    () = stops.recv() => std::process::exit(1),
+                }
+            }
+        }
+    };
+    farm.close().await;
+    // The progress channel closed with the farm: the teller ends by itself.
+    let _ = teller.await;
+    result
+}
+
+/// Writes the images of a complete render, or what there is of an incomplete one.
+async fn finish(
+    result: Result<RunSummary, FarmError>,
+    render: &RenderHandle,
+    arguments: &RenderArgs,
+) -> Result<(), Failure> {
+    match result {
+        Ok(summary) => {
+            write_images(render.image(), arguments).await?;
+            tell_summary(&summary, render, arguments)
+        }
+        Err(error @ (FarmError::Unreachable { .. } | FarmError::CoordinatorLost { .. })) => {
+            save_partial(render, arguments).await?;
+            Err(Failure::Unreachable(error.into()))
+        }
+        Err(error) => {
+            save_partial(render, arguments).await?;
+            Err(Failure::Work(error.into()))
+        }
+    }
+}
+
+async fn save_partial(render: &RenderHandle, arguments: &RenderArgs) -> Result<(), Failure> {
+    let image = render.partial_image();
+    let progress = render.progress();
+    if progress.samples == 0 {
+        eprintln!("farmctl: nothing was rendered yet: no image was written");
+        return Ok(());
+    }
+    write_images(image, arguments).await?;
+    eprintln!("farmctl: saved a partial image: {} of {} samples", progress.samples, progress.total_samples);
+    Ok(())
+}
+
+async fn write_images(image: Image, arguments: &RenderArgs) -> Result<(), Failure> {
+    let paths = arguments.images.clone();
+    let tone = Tone { exposure_ev: arguments.exposure };
+    let written = tokio::task::spawn_blocking(move || {
+        paths.iter().try_for_each(|path| output::write(path, &image, tone))
+    });
+    written.await.context("writing the image panicked")??;
+    Ok(())
+}
+
+fn tell_summary(summary: &RunSummary, render: &RenderHandle, arguments: &RenderArgs) -> Result<(), Failure> {
+    let film = render.progress();
+    for (what, count) in film.counters.faults() {
+        eprintln!("farmctl: warning: {count} {what} while rendering");
+    }
+    let prepare: Duration = summary.tasks.iter().map(|task| task.prepare_time).sum();
+    let seconds = summary.wall_time.saturating_sub(prepare).as_secs_f64();
+    #[expect(clippy::cast_precision_loss, reason = "a rate for people")]
+    let (samples_per_second, rays_per_second) = (film.samples as f64 / seconds, film.rays as f64 / seconds);
+    if arguments.progress == ProgressStyle::Ndjson {
+        let line = json!({
+            "event": "done",
+            "samples": film.samples,
+            "light_paths": film.light_paths,
+            "rays": film.rays,
+            "jobs": summary.jobs,
+            "replanned": summary.replanned,
+            "prepare_seconds": prepare.as_secs_f64(),
+            "render_seconds": seconds,
+            "device_seconds": summary.device_time.as_secs_f64(),
+            "samples_per_second": samples_per_second,
+            "rays_per_second": rays_per_second,
+        });
+        print_text(&format!("{line}\n"))?;
+    }
+    let images: Vec<String> = arguments.images.iter().map(|path| path.display().to_string()).collect();
+    eprintln!(
+        "farmctl: {} written: {} jobs in {seconds:.1} s, {:.3} M samples/s, {:.2} M rays/s{}",
+        images.join(", "),
+        summary.jobs,
+        samples_per_second / 1e6,
+        rays_per_second / 1e6,
+        if summary.replanned > 0 { format!(", {} jobs replanned", summary.replanned) } else { String::new() },
+    );
+    Ok(())
+}
+
+/// What the farm calls this application.
+fn app_name(scene: &Path) -> String {
+    let folder = if scene.is_file() { scene.parent().unwrap_or(scene) } else { scene };
+    let name = folder.file_name().unwrap_or(folder.as_os_str());
+    format!("render {}", name.to_string_lossy())
+}
+
+/// SIGINT and SIGTERM.
+struct Stops {
+    interrupt: Signal,
+    terminate: Signal,
+}
+
+impl Stops {
+    fn listen() -> Result<Self, Failure> {
+        Ok(Self { interrupt: signal(SignalKind::interrupt())?, terminate: signal(SignalKind::terminate())? })
+    }
+
+    async fn recv(&mut self) {
+        tokio::select! {
+            _ = self.interrupt.recv() => {}
+            _ = self.terminate.recv() => {}
+        }
+    }
+}

@@ -1,0 +1,201 @@
+//! `farmctl status`: the farm on one screen.
+
+use std::{collections::BTreeMap, time::Duration};
+
+use farm_core::coordinator::{AppStatus, DeviceStatus, FarmStatus, NodeState, NodeStatus};
+
+use crate::{
+    admin::Admin,
+    cli::{Format, StatusArgs},
+    failure::Failure,
+    output::{self, printable},
+};
+
+/// Prints the status once, or again and again.
+pub(crate) async fn run(
+    arguments: &StatusArgs,
+    coordinator: Option<&str>,
+    format: Format,
+) -> Result<(), Failure> {
+    let admin = Admin::new(coordinator);
+    let format = arguments.output.unwrap_or(format);
+    loop {
+        let status = admin.status().await?;
+        if arguments.watch.is_some() && matches!(format, Format::Table | Format::Wide) {
+            // Home and clear to the end: the screen does not flicker and keeps its scrollback.
+            output::print_text("\x1b[H\x1b[J")?;
+        }
+        output::print(&status, format, screen)?;
+        let Some(interval) = arguments.watch else { return Ok(()) };
+        tokio::time::sleep(interval.max(Duration::from_millis(100))).await;
+    }
+}
+
+/// The farm as text; `wide` adds addresses.
+fn screen(status: &FarmStatus, wide: bool) -> String {
+    let mut text = headline(status);
+    if !status.nodes.is_empty() {
+        text.push('\n');
+        text.push_str(&nodes_table(&status.nodes, wide));
+    }
+    if !status.apps.is_empty() {
+        text.push('\n');
+        text.push_str(&apps_table(&status.apps));
+    }
+    text
+}
+
+fn headline(status: &FarmStatus) -> String {
+    let devices: Vec<&DeviceStatus> = status.nodes.iter().flat_map(|node| &node.devices).collect();
+    let busy = devices.iter().filter(|device| device.running_jobs > 0).count();
+    let mut by_state: BTreeMap<&str, usize> = BTreeMap::new();
+    for node in &status.nodes {
+        *by_state.entry(state_word(node.state)).or_default() += 1;
+    }
+    let nodes = match by_state.is_empty() {
+        true => "no nodes: start one with `farm-worker --coordinator HOST:PORT`".to_owned(),
+        false => {
+            by_state.iter().map(|(state, count)| format!("{count} {state}")).collect::<Vec<_>>().join(", ")
+        }
+    };
+    let waiting: u64 = status.apps.iter().map(|app| app.waiting_jobs).sum();
+    let outstanding: u64 = status.apps.iter().map(|app| app.outstanding_jobs).sum();
+    let word = match (waiting, outstanding, status.nodes.is_empty()) {
+        (_, _, true) => "EMPTY",
+        (1.., _, _) => "WAITING",
+        (0, 1.., _) => "WORKING",
+        (0, 0, _) => "IDLE",
+    };
+    format!(
+        "{word}  nodes: {nodes}  devices: {busy} of {} busy  jobs: {outstanding} placed, {waiting} waiting, {} delivered, \
+         {} replanned  (coordinator {})\n",
+        devices.len(),
+        status.delivered_jobs,
+        status.replanned_jobs,
+        status.epoch,
+    )
+}
+
+fn nodes_table(nodes: &[NodeStatus], wide: bool) -> String {
+    let mut header =
+        vec!["NODE", "NAME", "STATE", "DEVICE", "KIND", "SCORE", "QUEUED", "RUNNING", "DONE", "DEVICE TIME"];
+    if wide {
+        header.push("ADDRESSES");
+    }
+    let mut table = output::table([]);
+    table.set_header(header);
+    for node in nodes {
+        for device in &node.devices {
+            let mut row = vec![
+                node.node.to_string(),
+                printable(&node.name),
+                state_word(node.state).to_owned(),
+                format!("{} {}", device.device.0, printable(&device.name)),
+                device.kind.to_string(),
+                format!("{:.0}", device.score),
+                device.planned_jobs.saturating_sub(u64::from(device.running_jobs)).to_string(),
+                device.running_jobs.to_string(),
+                device.executed_jobs.to_string(),
+                seconds(device.device_time_ns),
+            ];
+            if wide {
+                row.push(printable(&node.addresses.join(" ")));
+            }
+            table.add_row(row);
+        }
+    }
+    format!("{table}\n")
+}
+
+fn apps_table(apps: &[AppStatus]) -> String {
+    let mut table =
+        output::table(["APP", "NAME", "LINK", "WEIGHT", "WAITING", "PLACED", "DELIVERED", "DEVICE TIME"]);
+    for app in apps {
+        table.add_row([
+            app.app.to_string(),
+            printable(&app.name),
+            if app.connected { "up" } else { "lost" }.to_owned(),
+            format!("{}", app.weight),
+            app.waiting_jobs.to_string(),
+            app.outstanding_jobs.to_string(),
+            app.delivered_jobs.to_string(),
+            seconds(app.device_time_ns),
+        ]);
+    }
+    format!("{table}\n")
+}
+
+const fn state_word(state: NodeState) -> &'static str {
+    match state {
+        NodeState::Alive => "alive",
+        NodeState::Suspect => "suspect",
+        NodeState::Draining => "draining",
+    }
+}
+
+fn seconds(nanoseconds: u64) -> String {
+    format!("{:.1} s", Duration::from_nanos(nanoseconds).as_secs_f64())
+}
+
+#[cfg(test)]
+mod tests {
+    use farm_core::{
+        device::DeviceKind,
+        id::{AppId, DeviceIndex, Epoch, NodeId},
+    };
+
+    use super::*;
+
+    fn farm() -> FarmStatus {
+        let device = DeviceStatus {
+            device: DeviceIndex(0),
+            name: "llvmpipe".to_owned(),
+            kind: DeviceKind::Cpu,
+            score: 12.4,
+            planned_jobs: 5,
+            running_jobs: 1,
+            executed_jobs: 7,
+            device_time_ns: 1_500_000_000,
+        };
+        let node = NodeStatus {
+            node: NodeId(1),
+            name: "w0".to_owned(),
+            state: NodeState::Alive,
+            addresses: vec!["127.0.0.1:7800".to_owned()],
+            devices: vec![device],
+        };
+        let app = AppStatus {
+            app: AppId(3),
+            name: "render".to_owned(),
+            weight: 1.0,
+            connected: true,
+            waiting_jobs: 0,
+            outstanding_jobs: 5,
+            delivered_jobs: 7,
+            device_time_ns: 1_500_000_000,
+        };
+        FarmStatus {
+            epoch: Epoch(2),
+            nodes: vec![node],
+            apps: vec![app],
+            delivered_jobs: 7,
+            replanned_jobs: 0,
+        }
+    }
+
+    #[test]
+    fn the_screen_says_who_works_on_what() {
+        let text = screen(&farm(), false);
+        for wanted in ["WORKING", "1 alive", "1 of 1 busy", "llvmpipe", "render", "1.5 s"] {
+            assert!(text.contains(wanted), "{wanted:?} is missing in\n{text}");
+        }
+        assert!(!text.contains("7800"), "addresses are for `-o wide`");
+        assert!(screen(&farm(), true).contains("7800"), "`-o wide` shows addresses");
+    }
+
+    #[test]
+    fn an_empty_farm_says_what_to_do() {
+        let empty = FarmStatus { nodes: Vec::new(), apps: Vec::new(), ..farm() };
+        assert!(screen(&empty, false).contains("farm-worker"), "{}", screen(&empty, false));
+    }
+}

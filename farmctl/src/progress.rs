@@ -1,0 +1,162 @@
+//! How a long run tells how far it is: a bar on a terminal, lines of JSON for scripts, or nothing.
+
+use std::{
+    io::IsTerminal as _,
+    time::{Duration, Instant},
+};
+
+use client_sdk::{CoordinatorLink, Progress};
+use farm_core::message::WaitReason;
+use indicatif::{HumanCount, ProgressBar, ProgressStyle as BarStyle};
+use serde_json::json;
+use tokio::sync::watch;
+
+use crate::{cli::ProgressStyle, output};
+
+/// Redraws of the bar, and lines of JSON, are at least this far apart.
+const INTERVAL: Duration = Duration::from_millis(100);
+
+/// What the bar counts besides jobs.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Units {
+    /// Jobs of the whole run, where known beforehand.
+    pub jobs: u64,
+    /// Units of work of the whole run (samples, iterations).
+    pub total: f64,
+    /// What they are called.
+    pub name: &'static str,
+}
+
+/// Tells the progress until the farm's connection closes.
+pub(crate) async fn tell(mut progress: watch::Receiver<Progress>, style: ProgressStyle, units: Units) {
+    match style {
+        ProgressStyle::None => {}
+        ProgressStyle::Ndjson => tell_lines(&mut progress).await,
+        ProgressStyle::Auto if std::io::stderr().is_terminal() => tell_bar(&mut progress, units).await,
+        ProgressStyle::Auto => tell_waits(&mut progress).await,
+    }
+}
+
+async fn tell_lines(progress: &mut watch::Receiver<Progress>) {
+    loop {
+        let line = {
+            let now = progress.borrow_and_update();
+            json!({
+                "event": "progress",
+                "jobs_done": now.jobs_done,
+                "jobs_known": now.jobs_known,
+                "replanned": now.replanned,
+                "nodes": now.nodes,
+                "tasks": now.active_tasks.iter().map(|name| &**name).collect::<Vec<&str>>(),
+                "waiting": now.waiting.map(wait_words),
+            })
+        };
+        if output::print_text(&format!("{line}\n")).is_err() || progress.changed().await.is_err() {
+            return;
+        }
+        tokio::time::sleep(INTERVAL).await;
+    }
+}
+
+async fn tell_bar(progress: &mut watch::Receiver<Progress>, units: Units) {
+    let bar = ProgressBar::new(units.jobs);
+    let style = BarStyle::with_template("{prefix:>8} {wide_bar} {percent:>3}%  {msg}")
+        .expect("the template is valid");
+    bar.set_style(style);
+    let began = Instant::now();
+    loop {
+        {
+            let now = progress.borrow_and_update();
+            bar.set_position(now.jobs_done.min(units.jobs));
+            bar.set_prefix(now.active_tasks.last().map_or("start", |task| &**task).to_owned());
+            bar.set_message(message(&now, units, began.elapsed()));
+        }
+        if progress.changed().await.is_err() {
+            break;
+        }
+        tokio::time::sleep(INTERVAL).await;
+    }
+    bar.finish_and_clear();
+}
+
+/// Without a terminal only what needs a person's help is told, once each.
+async fn tell_waits(progress: &mut watch::Receiver<Progress>) {
+    let mut told = None;
+    loop {
+        let waiting = progress.borrow_and_update().waiting;
+        if let Some(reason) = waiting.filter(|_| waiting != told) {
+            eprintln!("farmctl: waiting: {}", wait_words(reason));
+        }
+        told = waiting;
+        if progress.changed().await.is_err() {
+            return;
+        }
+    }
+}
+
+fn message(now: &Progress, units: Units, elapsed: Duration) -> String {
+    if let Some(reason) = now.waiting {
+        return format!("waiting: {}", wait_words(reason));
+    }
+    if now.coordinator == CoordinatorLink::Reconnecting {
+        return "coordinator lost, trying again; nodes go on working".to_owned();
+    }
+    if now.jobs_done == 0 || units.jobs == 0 {
+        return String::new();
+    }
+    let share = count(now.jobs_done) / count(units.jobs);
+    let rate = units.total * share / elapsed.as_secs_f64();
+    let left = elapsed.mul_f64((1.0 - share).max(0.0) / share);
+    format!("{} {}/s  ETA {}  nodes {}", HumanCount(whole(rate)), units.name, clock(left), now.nodes)
+}
+
+const fn wait_words(reason: WaitReason) -> &'static str {
+    match reason {
+        WaitReason::NoNode => "no node is registered at the coordinator",
+        WaitReason::NoFittingDevice => "no device of the farm fits the jobs",
+    }
+}
+
+fn clock(duration: Duration) -> String {
+    let seconds = duration.as_secs();
+    match seconds {
+        0..60 => format!("{seconds}s"),
+        60..3_600 => format!("{}m{:02}s", seconds / 60, seconds % 60),
+        _ => format!("{}h{:02}m", seconds / 3_600, seconds % 3_600 / 60),
+    }
+}
+
+#[expect(clippy::cast_precision_loss, reason = "a count for people")]
+fn count(number: u64) -> f64 {
+    number as f64
+}
+
+#[expect(
+    clippy::cast_possible_truncation,
+    clippy::cast_sign_loss,
+    reason = "a rate for people; `as` saturates"
+)]
+fn whole(number: f64) -> u64 {
+    number as u64
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_bar_tells_rate_and_remaining_time() {
+        let now = Progress { jobs_done: 25, jobs_known: 100, nodes: 3, ..Progress::default() };
+        let units = Units { jobs: 100, total: 1_000_000.0, name: "samples" };
+        assert_eq!(message(&now, units, Duration::from_secs(10)), "25,000 samples/s  ETA 30s  nodes 3");
+        let stuck = Progress { waiting: Some(WaitReason::NoNode), ..now };
+        assert!(message(&stuck, units, Duration::from_secs(10)).contains("no node"));
+    }
+
+    #[test]
+    fn durations_read_well() {
+        assert_eq!(clock(Duration::from_secs(59)), "59s");
+        assert_eq!(clock(Duration::from_secs(61)), "1m01s");
+        assert_eq!(clock(Duration::from_secs(7_260)), "2h01m");
+    }
+}
