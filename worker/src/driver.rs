@@ -338,7 +338,10 @@ impl Driver {
                     *wanted = false;
                 }
             }
-            Effect::Exit => self.end = Some(End::Drained),
+            // After a refusal the machine exits too; the refusal is the reason.
+            Effect::Exit => {
+                self.end.get_or_insert(End::Drained);
+            }
         }
     }
 

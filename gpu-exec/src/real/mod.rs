@@ -18,11 +18,12 @@ mod trusted;
 
 use std::{
     sync::{
-        Arc,
+        Arc, Mutex, PoisonError,
         atomic::{AtomicBool, AtomicUsize, Ordering},
         mpsc,
     },
     thread as std_thread,
+    time::Duration,
 };
 
 use farm_core::{device::DeviceInfo, id::JobAttempt};
@@ -44,11 +45,17 @@ const DEPTH: usize = 2;
 /// Stack of a device's thread: naga recurses over the text of a module.
 const STACK_BYTES: usize = 16 << 20;
 
+/// How long the end of an executor waits for its thread: without it a process would unload the driver under a thread
+/// that still uses it. A hung device is left to the process' end.
+const CLOSE_PATIENCE: Duration = Duration::from_secs(2);
+
 /// The handle of a device's thread.
 #[derive(Debug)]
 pub(crate) struct RealDevice {
     inbox: mpsc::Sender<Message>,
     shared: Arc<Shared>,
+    /// Closed when the thread has dropped its device. A lock for `Sync` only: nobody but the drop takes it.
+    ended: Mutex<mpsc::Receiver<()>>,
 }
 
 /// What the handle and the thread both see.
@@ -82,13 +89,17 @@ impl RealDevice {
         let shared = Arc::<Shared>::default();
         // Bounded by DEPTH orders and the aborts of these.
         let (sender, inbox) = mpsc::channel();
+        let (ending, ended) = mpsc::channel();
         let thread = DeviceThread::new(spec, gpu, config, inbox, Arc::clone(&shared), on_event);
         std_thread::Builder::new()
             .name(format!("device {spec}"))
             .stack_size(STACK_BYTES)
-            .spawn(move || thread.run())
+            .spawn(move || {
+                thread.run();
+                drop(ending);
+            })
             .map_err(|source| OpenError::Thread { spec, source })?;
-        Ok((Self { inbox: sender, shared }, info))
+        Ok((Self { inbox: sender, shared, ended: Mutex::new(ended) }, info))
     }
 
     pub(crate) fn submit(&self, order: Order) -> Result<(), Busy> {
@@ -106,5 +117,15 @@ impl RealDevice {
     pub(crate) fn abort(&self, job: JobAttempt) {
         // A thread that has ended holds no job.
         let _ = self.inbox.send(Message::Abort(job));
+    }
+}
+
+impl Drop for RealDevice {
+    fn drop(&mut self) {
+        if self.inbox.send(Message::Close).is_ok() {
+            let ended = self.ended.get_mut().unwrap_or_else(PoisonError::into_inner);
+            // Closed without a message is the good case; too late is the hung one.
+            let _ = ended.recv_timeout(CLOSE_PATIENCE);
+        }
     }
 }

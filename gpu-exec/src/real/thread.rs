@@ -40,6 +40,8 @@ const MAX_ABANDONED: usize = 3;
 pub(super) enum Message {
     Order(Order),
     Abort(JobAttempt),
+    /// The handle is being dropped.
+    Close,
 }
 
 /// The thread's state.
@@ -129,27 +131,29 @@ impl DeviceThread {
         }
     }
 
-    /// Takes what has come; sleeps while there is nothing else to do.
+    /// Takes what has come; sleeps while there is nothing else to do. An error means that the handle is gone.
     fn take_messages(&mut self) -> Result<(), RecvError> {
         let state = &self.state;
         if state.running.is_none() && state.staged.is_none() && state.waiting.is_empty() {
             let message = self.inbox.recv()?;
-            self.take(message);
+            self.take(message)?;
         }
         loop {
             match self.inbox.try_recv() {
-                Ok(message) => self.take(message),
+                Ok(message) => self.take(message)?,
                 Err(TryRecvError::Empty) => return Ok(()),
                 Err(TryRecvError::Disconnected) => return Err(RecvError),
             }
         }
     }
 
-    fn take(&mut self, message: Message) {
+    fn take(&mut self, message: Message) -> Result<(), RecvError> {
         match message {
             Message::Order(order) => self.state.waiting.push(order),
             Message::Abort(job) => self.abort(job),
+            Message::Close => return Err(RecvError),
         }
+        Ok(())
     }
 
     fn abort(&mut self, job: JobAttempt) {
@@ -270,8 +274,10 @@ impl DeviceThread {
         (self.on_event)(ExecutorEvent::Lost { reason: reason.clone() });
         // An order may have been sent while the flag was being set.
         while let Ok(message) = self.inbox.recv() {
-            if let Message::Order(order) = message {
-                self.finished(order.job, 0, failure());
+            match message {
+                Message::Order(order) => self.finished(order.job, 0, failure()),
+                Message::Abort(_) => {}
+                Message::Close => return,
             }
         }
     }
