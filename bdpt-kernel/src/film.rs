@@ -275,7 +275,8 @@ impl Film {
         let eye = |pixel: &EyePixel| pixel.rgb.map(|sum| mean(sum, pixel.samples));
         let splat = |sums: &[f64; 3]| sums.map(|sum| mean(sum, self.light_paths));
         let both = self.eye.iter().map(eye).zip(self.splat.iter().map(splat));
-        let share = |sum: f32, count: u32| if count == 0 { 0.0 } else { to_f32(f64::from(sum) / f64::from(count)) };
+        let share =
+            |sum: f32, count: u32| if count == 0 { 0.0 } else { to_f32(f64::from(sum) / f64::from(count)) };
         Image {
             size: self.plan.size(),
             beauty: both.map(|(eye, splat)| std::array::from_fn(|c| to_f32(eye[c] + splat[c]))).collect(),
@@ -288,7 +289,12 @@ impl Film {
         }
     }
 
-    fn check_tile(&self, turn: TileTurn, layer: &TileLayer, name: &impl Fn() -> String) -> Result<(), FilmError> {
+    fn check_tile(
+        &self,
+        turn: TileTurn,
+        layer: &TileLayer,
+        name: &impl Fn() -> String,
+    ) -> Result<(), FilmError> {
         if turn.tile >= self.plan.tiles() || turn.slice >= self.plan.slices() {
             return Err(FilmError::Foreign { layer: name() });
         }
@@ -385,7 +391,8 @@ mod tests {
     fn value(a: u32, b: u32) -> f32 {
         let exponent = (a.wrapping_mul(2_654_435_761).wrapping_add(b.wrapping_mul(40_503)) >> 16) % 60;
         let sign = if (a + b).is_multiple_of(2) { 1.0 } else { -1.0 };
-        sign * (1.0 + f32::from(u8::try_from((a * 7 + b * 13) % 251).unwrap()) / 251.0) * (exponent as f32 - 30.0).exp2()
+        sign * (1.0 + f32::from(u8::try_from((a * 7 + b * 13) % 251).unwrap()) / 251.0)
+            * (exponent as f32 - 30.0).exp2()
     }
 
     fn layer_of(job: PlannedJob) -> Layer {
@@ -400,24 +407,39 @@ mod tests {
                     rays: 3,
                     padding: 0,
                 };
-                let hit = FirstHit { albedo: [0.5; 3], samples: 2, normal: [0.0, 0.0, 1.0], depth: 8.0, hits: 1, padding: [0; 3] };
-                Layer::Tile(turn, TileLayer {
-                    x_px: job.x_px,
-                    y_px: job.y_px,
-                    width_px: job.width_px,
-                    height_px: job.height_px,
-                    pixels: (0..pixels).map(sum).collect(),
-                    first_hits: vec![hit; pixels as usize],
-                    counters: Counters::default(),
-                })
+                let hit = FirstHit {
+                    albedo: [0.5; 3],
+                    samples: 2,
+                    normal: [0.0, 0.0, 1.0],
+                    depth: 8.0,
+                    hits: 1,
+                    padding: [0; 3],
+                };
+                Layer::Tile(
+                    turn,
+                    TileLayer {
+                        x_px: job.x_px,
+                        y_px: job.y_px,
+                        width_px: job.width_px,
+                        height_px: job.height_px,
+                        pixels: (0..pixels).map(sum).collect(),
+                        first_hits: vec![hit; pixels as usize],
+                        counters: Counters::default(),
+                    },
+                )
             }
-            PlannedJob::Light(turn, job) => Layer::Splats(turn, SplatLayer {
-                width_px: 100,
-                height_px: 70,
-                rgb: (0..7_000).map(|i| [value(turn, i), value(turn + 9, i), value(turn + 5, i)]).collect(),
-                paths: job.paths,
-                counters: Counters { rays: 10, ..Counters::default() },
-            }),
+            PlannedJob::Light(turn, job) => Layer::Splats(
+                turn,
+                SplatLayer {
+                    width_px: 100,
+                    height_px: 70,
+                    rgb: (0..7_000)
+                        .map(|i| [value(turn, i), value(turn + 9, i), value(turn + 5, i)])
+                        .collect(),
+                    paths: job.paths,
+                    counters: Counters { rays: 10, ..Counters::default() },
+                },
+            ),
         }
     }
 
@@ -469,14 +491,18 @@ mod tests {
         let sum = |order: &mut dyn Iterator<Item = u32>, i: u32| {
             order.fold(0.0_f64, |sum, slice| sum + f64::from(value(slice, i)))
         };
-        let differ = (0..4_096).filter(|&i| sum(&mut (0..slices), i) != sum(&mut (0..slices).rev(), i)).count();
+        let differ =
+            (0..4_096).filter(|&i| sum(&mut (0..slices), i) != sum(&mut (0..slices).rev(), i)).count();
         assert!(differ > 0, "the values do not depend on their order");
     }
 
     #[test]
     fn a_part_of_the_jobs_is_a_valid_image() {
         let empty = Film::new(plan());
-        assert!(empty.image().beauty.iter().flatten().all(|value| *value == 0.0), "nothing merged is black, not NaN");
+        assert!(
+            empty.image().beauty.iter().flatten().all(|value| *value == 0.0),
+            "nothing merged is black, not NaN"
+        );
         let constant = |layer: Layer| match layer {
             Layer::Tile(turn, mut layer) => {
                 // Each sample 0.5 in red: the mean is 0.5 after any number of slices.
@@ -506,7 +532,10 @@ mod tests {
     #[test]
     fn held_layers_can_be_merged_when_nothing_more_comes() {
         let mut film = Film::new(plan());
-        let late: Vec<Layer> = layers().into_iter().filter(|layer| !matches!(layer, Layer::Tile(t, _) if t.slice == 0)).collect();
+        let late: Vec<Layer> = layers()
+            .into_iter()
+            .filter(|layer| !matches!(layer, Layer::Tile(t, _) if t.slice == 0))
+            .collect();
         late.into_iter().for_each(|layer| add(&mut film, layer).unwrap());
         assert_eq!(film.progress().samples, 0, "nothing has its turn before the first slices");
         film.merge_held();
@@ -537,7 +566,10 @@ mod tests {
         let mut short = layer.clone();
         short.pixels.pop();
         assert!(matches!(film.add_tile(next, short), Err(FilmError::Shape { .. })), "a pixel is missing");
-        assert!(matches!(film.add_tile(next, layer), Err(FilmError::Shape { .. })), "the last slice has fewer samples");
+        assert!(
+            matches!(film.add_tile(next, layer), Err(FilmError::Shape { .. })),
+            "the last slice has fewer samples"
+        );
         assert_eq!(bytes(&film.image()), before);
     }
 

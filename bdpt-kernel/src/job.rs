@@ -15,7 +15,8 @@ use crate::{
     bvh::{BuildQuality, Bvh},
     film::{Film, FilmProgress, Image, MAX_HELD_TILES},
     gpu::{
-        self, FrameError, FrameParams, Integrator, LightJob, NormalisedScene, PackedScene, SceneContents, TileJob,
+        self, FrameError, FrameParams, Integrator, LightJob, NormalisedScene, PackedScene, SceneContents,
+        TileJob,
     },
     plan::{Cursor, LightImage, PlannedJob, RenderPlan, TileTurn},
     scene::model::{FilmSize, Scene},
@@ -161,9 +162,9 @@ impl Shared {
     }
 
     fn prepared(&self) -> Result<&Prepared, DispatchError> {
-        self.prepared
-            .get()
-            .ok_or_else(|| DispatchError::Application(format!("task `{RENDER_TASK}` must run after `{BVH_TASK}`")))
+        self.prepared.get().ok_or_else(|| {
+            DispatchError::Application(format!("task `{RENDER_TASK}` must run after `{BVH_TASK}`"))
+        })
     }
 }
 
@@ -185,7 +186,8 @@ struct BvhTask {
 
 impl Task for BvhTask {
     fn prepare(&mut self, data: &mut TaskData) -> Result<(), TaskError> {
-        let scene = self.scene.take().ok_or_else(|| TaskError::application("the scene was prepared before"))?;
+        let scene =
+            self.scene.take().ok_or_else(|| TaskError::application("the scene was prepared before"))?;
         let normalised = NormalisedScene::new(&scene);
         drop(scene);
         let triangles = &normalised.scene().triangles;
@@ -352,7 +354,9 @@ mod tests {
             let error = render_graph(scene(), RenderOptions::new(size, spp, 1)).unwrap_err();
             assert_eq!(error, RenderError::Samples { spp });
         }
-        for size in [FilmSize { width_px: 0, height_px: 64 }, FilmSize { width_px: 16_000, height_px: 16_000 }] {
+        for size in
+            [FilmSize { width_px: 0, height_px: 64 }, FilmSize { width_px: 16_000, height_px: 16_000 }]
+        {
             let error = render_graph(scene(), RenderOptions::new(size, 1, 1)).unwrap_err();
             assert!(matches!(error, RenderError::Frame(FrameError::Size { .. })), "{error}");
         }
@@ -364,10 +368,14 @@ mod tests {
         let (graph, handle) = render_graph(scene(), RenderOptions::new(size, 8, 1)).unwrap();
         assert!(format!("{graph:?}").contains("(\"render\", \"bvh\")"), "{graph:?}");
         let progress = handle.progress();
-        assert_eq!((progress.samples, progress.total_samples, progress.total_light_paths), (0, 160_000, 160_000));
+        assert_eq!(
+            (progress.samples, progress.total_samples, progress.total_light_paths),
+            (0, 160_000, 160_000)
+        );
         assert_eq!(handle.bvh(), None);
         assert!(handle.image().beauty.iter().all(|pixel| *pixel == [0.0; 3]), "nothing is black, not NaN");
-        let options = gpu::RenderOptions { integrator: Integrator::PathTracing, ..gpu::RenderOptions::default() };
+        let options =
+            gpu::RenderOptions { integrator: Integrator::PathTracing, ..gpu::RenderOptions::default() };
         let options = RenderOptions { integrator: options, ..RenderOptions::new(size, 8, 1) };
         let (_, handle) = render_graph(scene(), options).unwrap();
         assert_eq!(handle.plan().light_jobs(), 0);
@@ -391,7 +399,10 @@ mod tests {
             // The newest results come first.
             for number in (tile..task.cursor.tiles_out()).rev() {
                 let (turn, job) = plan.tile_job(number);
-                task.shared.film().add_tile(turn, tile_layer(&job)).expect("the window is what the film holds");
+                task.shared
+                    .film()
+                    .add_tile(turn, tile_layer(&job))
+                    .expect("the window is what the film holds");
             }
             for number in (light..task.cursor.lights_out()).rev() {
                 let paths = plan.light_job(number).paths;

@@ -81,7 +81,8 @@ impl ImageFormat {
     /// # Errors
     /// The extension is neither `.exr` nor `.png`.
     pub fn of(path: &Path) -> Result<Self, OutputError> {
-        let extension = path.extension().and_then(|extension| extension.to_str()).map(str::to_ascii_lowercase);
+        let extension =
+            path.extension().and_then(|extension| extension.to_str()).map(str::to_ascii_lowercase);
         match extension.as_deref() {
             Some("exr") => Ok(Self::Exr),
             Some("png") => Ok(Self::Png),
@@ -302,7 +303,9 @@ mod tests {
         let read = exr::prelude::read_first_rgba_layer_from_file(
             &path,
             |size, _| vec![[0.0_f32; 3]; size.area()],
-            |pixels: &mut Vec<[f32; 3]>, at, (r, g, b, _): (f32, f32, f32, f32)| pixels[at.y() * 37 + at.x()] = [r, g, b],
+            |pixels: &mut Vec<[f32; 3]>, at, (r, g, b, _): (f32, f32, f32, f32)| {
+                pixels[at.y() * 37 + at.x()] = [r, g, b]
+            },
         )
         .unwrap();
         assert_eq!(read.layer_data.channel_data.pixels, image().beauty);
@@ -321,7 +324,11 @@ mod tests {
         assert_eq!(read.get_pixel(0, 0).0, [127, 255, 255], "0.214 linear is half of sRGB");
         assert_eq!(read.get_pixel(36, 18).0, [0, 188, 0]);
         write(&path, &image, Tone { exposure_ev: 1.0 }).unwrap();
-        assert_eq!(image::open(&path).unwrap().into_rgb8().get_pixel(36, 18).0, [0, 255, 0], "a stop more doubles");
+        assert_eq!(
+            image::open(&path).unwrap().into_rgb8().get_pixel(36, 18).0,
+            [0, 255, 0],
+            "a stop more doubles"
+        );
     }
 
     #[test]
@@ -360,7 +367,8 @@ mod tests {
         assert!(matches!(error, OutputError::Encode { .. }), "{error}");
         assert_eq!(fs::read(&path).unwrap(), b"before", "a failed write changes nothing");
         write(&path, &image(), Tone::default()).unwrap();
-        let names: Vec<_> = fs::read_dir(folder.path()).unwrap().map(|entry| entry.unwrap().file_name()).collect();
+        let names: Vec<_> =
+            fs::read_dir(folder.path()).unwrap().map(|entry| entry.unwrap().file_name()).collect();
         assert_eq!(names, ["a.exr"]);
     }
 }

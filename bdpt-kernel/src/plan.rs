@@ -93,7 +93,8 @@ impl RenderPlan {
                 (paths / MIN_LIGHT_PATHS).clamp(1, SPREAD_LIGHT_JOBS).max(paths.div_ceil(MAX_LIGHT_PATHS))
             }
         };
-        let light_jobs = u32::try_from(light_jobs).expect("2^32 samples of 2^28 pixels are 2^36 jobs of 2^24 at most");
+        let light_jobs =
+            u32::try_from(light_jobs).expect("2^32 samples of 2^28 pixels are 2^36 jobs of 2^24 at most");
         Self { size, samples, seed, slice: slice.min(samples), light_jobs }
     }
 

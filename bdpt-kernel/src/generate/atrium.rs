@@ -112,7 +112,10 @@ fn hall(obj: &mut ObjWriter<'_>) -> io::Result<()> {
     for (name, side) in [("north_gallery", -1.0_f32), ("south_gallery", 1.0)] {
         obj.object(name, "plaster")?;
         let (inner, outer) = (side * 4.2, side * (z - 0.001));
-        obj.cuboid(Vec3::new(-x + 0.001, 4.2, inner.min(outer)), Vec3::new(x - 0.001, 4.5, inner.max(outer)))?;
+        obj.cuboid(
+            Vec3::new(-x + 0.001, 4.2, inner.min(outer)),
+            Vec3::new(x - 0.001, 4.5, inner.max(outer)),
+        )?;
         obj.object(&format!("{name}_rail"), "sandstone")?;
         let rail = side * 4.35;
         obj.cuboid(Vec3::new(-x + 0.002, 5.4, rail - 0.1), Vec3::new(x - 0.002, 5.5, rail + 0.1))?;
@@ -142,7 +145,8 @@ fn profile(detail: u16, at: impl Fn(f32) -> (f32, f32)) -> Vec<(f32, f32)> {
 }
 
 fn columns(obj: &mut ObjWriter<'_>, detail: u16) -> io::Result<()> {
-    for (storey, bottom, height, radius) in [("lower", 0.0_f32, 4.2_f32, 0.36_f32), ("upper", 4.5, 2.5, 0.24)] {
+    for (storey, bottom, height, radius) in [("lower", 0.0_f32, 4.2_f32, 0.36_f32), ("upper", 4.5, 2.5, 0.24)]
+    {
         // Swelling in the middle, mouldings at foot and head.
         let shaft = profile(detail, |t| {
             let moulding = (-60.0 * t).exp() + (-60.0 * (1.0 - t)).exp();

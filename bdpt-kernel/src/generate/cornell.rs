@@ -72,7 +72,11 @@ pub(super) fn geometry(variant: CornellVariant, obj: &mut ObjWriter<'_>) -> io::
     face("left_wall", "red", [[552.8, 0.0, 0.0], [549.6, 0.0, back], [556.0, top, back], [556.0, top, 0.0]])?;
     // A little below the ceiling, which it would else coincide with.
     let lamp = top - 0.3;
-    face("lamp", "lamp", [[343.0, lamp, 227.0], [343.0, lamp, 332.0], [213.0, lamp, 332.0], [213.0, lamp, 227.0]])?;
+    face(
+        "lamp",
+        "lamp",
+        [[343.0, lamp, 227.0], [343.0, lamp, 332.0], [213.0, lamp, 332.0], [213.0, lamp, 227.0]],
+    )?;
 
     let (tall, short) = match variant {
         CornellVariant::Spheres => {

@@ -49,6 +49,23 @@ pub struct UnknownScene {
     pub name: String,
 }
 
+/// A number of triangles that a scene cannot have.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Error)]
+pub enum TrianglesError {
+    /// The scene comes in one size.
+    #[error("{kind} has no choice of triangles (only an atrium has)")]
+    Fixed {
+        /// The scene.
+        kind: SceneKind,
+    },
+    /// Too few or too many.
+    #[error("{triangles} triangles: an atrium has {}..={MAX_ATRIUM_TRIANGLES}", atrium::MIN_TRIANGLES)]
+    OutOfRange {
+        /// As given.
+        triangles: u32,
+    },
+}
+
 /// A scene could not be written.
 #[derive(Debug, Error)]
 pub enum GenerateError {
@@ -79,6 +96,20 @@ impl SceneKind {
         "furnace",
         "atrium",
     ];
+
+    /// The same scene of about so many triangles.
+    ///
+    /// # Errors
+    /// The scene has one size only, or the number is out of range.
+    pub fn with_triangles(self, triangles: u32) -> Result<Self, TrianglesError> {
+        match self {
+            Self::Atrium { .. } if (atrium::MIN_TRIANGLES..=atrium::MAX_TRIANGLES).contains(&triangles) => {
+                Ok(Self::Atrium { triangles })
+            }
+            Self::Atrium { .. } => Err(TrianglesError::OutOfRange { triangles }),
+            kind => Err(TrianglesError::Fixed { kind }),
+        }
+    }
 }
 
 impl FromStr for SceneKind {
@@ -97,8 +128,9 @@ impl FromStr for SceneKind {
             _ => {
                 let count = name.strip_prefix("atrium-").ok_or_else(unknown)?;
                 let triangles = count.parse().map_err(|_| unknown())?;
-                let fits = (atrium::MIN_TRIANGLES..=atrium::MAX_TRIANGLES).contains(&triangles);
-                if fits { Ok(Self::Atrium { triangles }) } else { Err(unknown()) }
+                Self::Atrium { triangles: DEFAULT_ATRIUM_TRIANGLES }
+                    .with_triangles(triangles)
+                    .map_err(|_| unknown())
             }
         }
     }
@@ -216,6 +248,14 @@ mod tests {
     }
 
     #[test]
+    fn only_an_atrium_has_a_choice_of_triangles() {
+        let atrium: SceneKind = "atrium".parse().unwrap();
+        assert_eq!(atrium.with_triangles(50_000), Ok(SceneKind::Atrium { triangles: 50_000 }));
+        assert!(matches!(atrium.with_triangles(9), Err(TrianglesError::OutOfRange { triangles: 9 })));
+        assert!(matches!(SceneKind::Caustic.with_triangles(50_000), Err(TrianglesError::Fixed { .. })));
+    }
+
+    #[test]
     fn a_scene_is_never_overwritten() {
         let folder = tempfile::tempdir().unwrap();
         write(SceneKind::Furnace, folder.path()).unwrap();
@@ -252,7 +292,10 @@ mod tests {
             ("atrium-20000", Vec3::new(0.0, 2.0, 0.0)),
         ] {
             let scene = generated(name).scene;
-            let lamps = scene.triangles.iter().filter(|t| scene.materials[t.material as usize].emission != Vec3::ZERO);
+            let lamps = scene
+                .triangles
+                .iter()
+                .filter(|t| scene.materials[t.material as usize].emission != Vec3::ZERO);
             for triangle in lamps {
                 let [a, b, c] = triangle.positions;
                 assert!((b - a).cross(c - a).dot(into - a) > 0.0, "{name}: a lamp at {a} looks away");

@@ -197,7 +197,9 @@ pub enum GeometryFault {
         corner: String,
     },
     /// An index names nothing.
-    #[error("{what} index {index} is out of range: the file has {count} (indices start at 1, or count back from -1)")]
+    #[error(
+        "{what} index {index} is out of range: the file has {count} (indices start at 1, or count back from -1)"
+    )]
     Index {
         /// `vertex`, `texture coordinate` or `normal`.
         what: &'static str,

@@ -120,7 +120,11 @@ fn scene_file(path: &Path) -> Result<PathBuf, SceneError> {
         return if file.exists() { Ok(file) } else { Err(SceneError::NotAScene { path: path.to_owned() }) };
     }
     // A path that is not there gets the reader's error, whatever it is called.
-    if is_toml || !path.exists() { Ok(path.to_owned()) } else { Err(SceneError::NotAScene { path: path.to_owned() }) }
+    if is_toml || !path.exists() {
+        Ok(path.to_owned())
+    } else {
+        Err(SceneError::NotAScene { path: path.to_owned() })
+    }
 }
 
 struct Loader<'a> {
@@ -143,8 +147,16 @@ impl Loader<'_> {
         let (report, count) = (&mut self.report, geometry.degenerate);
         report.degenerate_triangles += count;
         report.warn_counted(count, &path, "degenerate triangles (no area) left out");
-        report.warn_counted(geometry.replaced_normals, &path, "unusable vertex normals replaced by the face's");
-        report.warn_counted(geometry.turned_normals, &path, "triangles with normals against their winding turned round");
+        report.warn_counted(
+            geometry.replaced_normals,
+            &path,
+            "unusable vertex normals replaced by the face's",
+        );
+        report.warn_counted(
+            geometry.turned_normals,
+            &path,
+            "triangles with normals against their winding turned round",
+        );
         report.warn_counted(geometry.concave, &path, "concave polygons triangulated as fans");
         geometry.warnings.drain(..).for_each(|warning| report.warn(warning));
 
@@ -206,12 +218,16 @@ impl Loader<'_> {
         match (described, libraries) {
             (Some(described), _) => Ok(self.named_material(name, &described.surface)),
             (None, None) => {
-                self.report.warn(format!("{place}: material \"{name}\" is defined nowhere: rendered as grey diffuse"));
+                self.report.warn(format!(
+                    "{place}: material \"{name}\" is defined nowhere: rendered as grey diffuse"
+                ));
                 Ok(self.named_material(name, &grey))
             }
-            (None, Some(_)) => {
-                Err(SceneError::UnknownMaterial { place, object: used.object.clone(), material: name.clone() })
-            }
+            (None, Some(_)) => Err(SceneError::UnknownMaterial {
+                place,
+                object: used.object.clone(),
+                material: name.clone(),
+            }),
         }
     }
 

@@ -74,7 +74,12 @@ impl Library {
                 continue;
             }
             let Some(block) = block.as_mut() else {
-                return Err(fault(source, line, None, format!("`{}` before any `newmtl`", excerpt(statement))));
+                return Err(fault(
+                    source,
+                    line,
+                    None,
+                    format!("`{}` before any `newmtl`", excerpt(statement)),
+                ));
             };
             let known = block
                 .read(statement, rest)
@@ -86,7 +91,9 @@ impl Library {
         library.keep(source, block.take());
         if let Some((line, statement, count)) = unknown {
             let place = source.line(line);
-            library.warnings.push(format!("{place}: {count} unknown statements ignored, the first is `{statement}`"));
+            library
+                .warnings
+                .push(format!("{place}: {count} unknown statements ignored, the first is `{statement}`"));
         }
         Ok(library)
     }
@@ -96,7 +103,8 @@ impl Library {
         let place = source.line(block.line);
         let material = DescribedMaterial { surface: block.surface(), place: place.clone() };
         if self.materials.insert(block.name.clone(), material).is_some() {
-            self.warnings.push(format!("{place}: material \"{}\" is defined again: the later one counts", block.name));
+            self.warnings
+                .push(format!("{place}: material \"{}\" is defined again: the later one counts", block.name));
         }
     }
 }
@@ -121,7 +129,9 @@ impl Block {
             "Tr" => self.dissolve = Some(1.0 - number(statement, rest)?),
             "illum" => {
                 let model = rest.split_whitespace().next().unwrap_or("");
-                let model = model.parse().map_err(|_| format!("`illum` needs a whole number, found `{}`", excerpt(rest)))?;
+                let model = model
+                    .parse()
+                    .map_err(|_| format!("`illum` needs a whole number, found `{}`", excerpt(rest)))?;
                 self.illumination = Some(model);
             }
             "Pr" => self.physical("Pr", number(statement, rest)? < 1.0),
@@ -157,10 +167,15 @@ impl Block {
         let surface = if self.is_transparent() {
             self.transparent(diffuse, &mut ignored)
         } else if self.is_mirror(diffuse, specular) {
-            Surface::of(Bsdf::Mirror { reflectance: capped("Ks", self.specular.unwrap_or(Vec3::ONE), &mut ignored) })
+            Surface::of(Bsdf::Mirror {
+                reflectance: capped("Ks", self.specular.unwrap_or(Vec3::ONE), &mut ignored),
+            })
         } else {
-            let (key, colour) =
-                if diffuse == Vec3::ZERO && specular != Vec3::ZERO { ("Ks", specular) } else { ("Kd", diffuse) };
+            let (key, colour) = if diffuse == Vec3::ZERO && specular != Vec3::ZERO {
+                ("Ks", specular)
+            } else {
+                ("Kd", diffuse)
+            };
             let colour = capped(key, colour, &mut ignored);
             match self.gloss(specular) {
                 Some(look) => Surface::instead_of(&look, colour),
@@ -214,7 +229,9 @@ fn capped(key: &str, colour: Vec3, ignored: &mut Vec<String>) -> Vec3 {
 
 /// Three numbers, or one for all three; not negative.
 fn colour(statement: &str, rest: &str) -> Result<Vec3, String> {
-    let wrong = || format!("`{statement}` needs 3 numbers that are finite and not negative, found `{}`", excerpt(rest));
+    let wrong = || {
+        format!("`{statement}` needs 3 numbers that are finite and not negative, found `{}`", excerpt(rest))
+    };
     let mut numbers = Vec::with_capacity(3);
     for word in rest.split_whitespace().take_while(|word| !word.starts_with('#')).take(3) {
         let value: f32 = word.parse().map_err(|_| wrong())?;

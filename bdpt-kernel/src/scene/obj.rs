@@ -275,7 +275,9 @@ impl<'a> Scan<'a> {
         let narrow = |index: i64| u32::try_from(index).expect("checked to be below 2^32 above");
         match indices[0] {
             None => Err(self.fault(GeometryFault::Corner { corner: excerpt(word) })),
-            Some(vertex) => Ok(Corner { vertex: narrow(vertex), normal: indices[2].map_or(NO_NORMAL, narrow) }),
+            Some(vertex) => {
+                Ok(Corner { vertex: narrow(vertex), normal: indices[2].map_or(NO_NORMAL, narrow) })
+            }
         }
     }
 
@@ -297,7 +299,8 @@ impl<'a> Scan<'a> {
         let index = self.material_indices.get(&name).copied().unwrap_or_else(|| {
             let line = self.current.map_or(self.line, |(_, line)| line);
             let object = self.object.map(ToOwned::to_owned);
-            let index = u32::try_from(self.materials.len()).expect("fewer materials than lines, of which 2^32 do not fit");
+            let index = u32::try_from(self.materials.len())
+                .expect("fewer materials than lines, of which 2^32 do not fit");
             self.materials.push(UsedMaterial { name: name.map(ToOwned::to_owned), line, object });
             self.material_indices.insert(name, index);
             index
@@ -320,10 +323,11 @@ impl<'a> Scan<'a> {
     }
 
     fn into_geometry(mut self) -> Result<Geometry, SceneError> {
-        let (low, high) = self
-            .positions
-            .iter()
-            .fold((Vec3::MAX, Vec3::MIN), |(low, high), position| (low.min(*position), high.max(*position)));
+        // Of what faces use: a stray vertex far out must not make the rest look small.
+        let used =
+            self.triangles.iter().flat_map(|(corners, _)| corners).map(|c| self.positions[c.vertex as usize]);
+        let (low, high) = used
+            .fold((Vec3::MAX, Vec3::MIN), |(low, high), position| (low.min(position), high.max(position)));
         let extent = (high - low).max_element();
         let scale = if extent > 0.0 { extent.recip() } else { 1.0 };
         let mut geometry = Geometry { concave: self.concave_polygons(), ..Geometry::default() };
@@ -332,8 +336,8 @@ impl<'a> Scan<'a> {
             let positions = corners.map(|corner| self.positions[corner.vertex as usize]);
             let [a, b, c] = positions;
             let cross = ((b - a) * scale).cross((c - a) * scale);
-            // Written so that NaN counts as degenerate too.
-            if !(cross.length_squared() > LEAST_CROSS_SQUARED) {
+            let squared = cross.length_squared();
+            if squared.is_nan() || squared <= LEAST_CROSS_SQUARED {
                 geometry.degenerate += 1;
                 continue;
             }
@@ -426,11 +430,15 @@ mod tests {
 
     #[test]
     fn normals_are_repaired_and_counted() {
-        let text = format!("{SQUARE}vn 0 0 0\nvn nan 0 1\nvn 0 1 1\nvn 0 0 -1\nf 1//1 2//2 3//3\nf 1//4 3//4 4//4");
+        let text =
+            format!("{SQUARE}vn 0 0 0\nvn nan 0 1\nvn 0 1 1\nvn 0 0 -1\nf 1//1 2//2 3//3\nf 1//4 3//4 4//4");
         let geometry = parse(&text).unwrap();
         assert_eq!((geometry.replaced_normals, geometry.turned_normals), (2, 1));
         assert_eq!(geometry.triangles[0].normals[..2], [Vec3::Z; 2]);
-        assert!((geometry.triangles[0].normals[2] - Vec3::new(0.0, 0.5_f32.sqrt(), 0.5_f32.sqrt())).length() < 1e-6);
+        assert!(
+            (geometry.triangles[0].normals[2] - Vec3::new(0.0, 0.5_f32.sqrt(), 0.5_f32.sqrt())).length()
+                < 1e-6
+        );
         assert_eq!(geometry.triangles[1].normals, [Vec3::Z; 3]);
     }
 
@@ -438,6 +446,9 @@ mod tests {
     fn degenerate_and_concave_faces_are_counted() {
         let geometry = parse(&format!("{SQUARE}v 2 0 0\nf 1 2 3\nf 1 1 2\nf 1 2 5")).unwrap();
         assert_eq!((geometry.triangles.len(), geometry.degenerate), (1, 2));
+        let small = SQUARE.replace('1', "0.01");
+        let stray = parse(&format!("{small}v 9e8 9e8 9e8\nf 1 2 3")).unwrap();
+        assert_eq!((stray.triangles.len(), stray.degenerate), (1, 0), "a vertex that nobody uses");
         let arrow = "v 0 0 0\nv 2 -1 0\nv 1 0 0\nv 2 1 0\nf 2 3 4 1\n";
         assert_eq!(parse(arrow).unwrap().concave, 1, "the fan from the arrow's barb leaves the polygon");
         assert_eq!(parse(&format!("{SQUARE}f 1 2 3 4")).unwrap().concave, 0, "a square is convex");
@@ -476,7 +487,10 @@ mod tests {
         }
         for (face, expected) in [
             ("f 1 2 5", "a.obj:6: object \"lid\": vertex index 5 is out of range: the file has 4"),
-            ("f 1/1 2/1 3/1", "a.obj:6: object \"lid\": texture coordinate index 1 is out of range: the file has 0"),
+            (
+                "f 1/1 2/1 3/1",
+                "a.obj:6: object \"lid\": texture coordinate index 1 is out of range: the file has 0",
+            ),
             ("f 1//2 2//1 3//1", "a.obj:6: object \"lid\": normal index 2 is out of range: the file has 0"),
         ] {
             let error = parse(&format!("{SQUARE}o lid\n{face}\no other\nf 1 2 3")).unwrap_err().to_string();

@@ -40,9 +40,8 @@ impl Source {
             let place = Place { file: path.to_owned(), line: Some(line) };
             return Err(SceneError::NotText { place, byte: bytes[at] });
         }
-        let text = String::from_utf8(bytes).unwrap_or_else(|error| {
-            String::from_utf8_lossy(error.as_bytes()).into_owned()
-        });
+        let text = String::from_utf8(bytes)
+            .unwrap_or_else(|error| String::from_utf8_lossy(error.as_bytes()).into_owned());
         Ok(Self { path: path.to_owned(), text })
     }
 
@@ -99,7 +98,9 @@ mod tests {
         for good in ["a.mtl", "./a.mtl", "sub/a.mtl", "sub\\a.mtl", "a b.mtl", "..a.mtl"] {
             assert!(path_inside(folder, good).is_some_and(|path| path.starts_with(folder)), "{good}");
         }
-        for bad in ["", "/etc/passwd", "../a.mtl", "sub/../../a.mtl", "..\\a.mtl", "\\\\host\\a", "C:\\a.mtl", "c:a"] {
+        for bad in
+            ["", "/etc/passwd", "../a.mtl", "sub/../../a.mtl", "..\\a.mtl", "\\\\host\\a", "C:\\a.mtl", "c:a"]
+        {
             assert_eq!(path_inside(folder, bad), None, "{bad}");
         }
     }

@@ -195,7 +195,11 @@ impl Check<'_> {
         good: impl Fn(f32) -> bool,
     ) -> Result<f32, SceneError> {
         let number = *value.get_ref();
-        if good(number) { Ok(number) } else { Err(self.wrong(value, key, format!("{number} must be {needs}"))) }
+        if good(number) {
+            Ok(number)
+        } else {
+            Err(self.wrong(value, key, format!("{number} must be {needs}")))
+        }
     }
 
     fn positive(&self, value: &Spanned<f32>, key: &str) -> Result<f32, SceneError> {
@@ -219,19 +223,28 @@ impl Check<'_> {
         let eye = self.finite3(&raw.eye, "camera.eye")?;
         let target = self.finite3(&raw.target, "camera.target")?;
         let up = self.finite3(&raw.up, "camera.up")?;
-        let hfov_deg = self.number(&raw.hfov_deg, "camera.hfov_deg", "between 0 and 180 degrees", |degrees| {
-            degrees > 0.0 && degrees < 180.0
-        })?;
+        let hfov_deg =
+            self.number(&raw.hfov_deg, "camera.hfov_deg", "between 0 and 180 degrees", |degrees| {
+                degrees > 0.0 && degrees < 180.0
+            })?;
         let axis = (target - eye).as_dvec3();
         if axis.length_squared() == 0.0 {
-            return Err(self.wrong(&raw.target, "camera.target", "equals camera.eye: the camera looks nowhere"));
+            return Err(self.wrong(
+                &raw.target,
+                "camera.target",
+                "equals camera.eye: the camera looks nowhere",
+            ));
         }
         if up == Vec3::ZERO {
             return Err(self.wrong(&raw.up, "camera.up", "must not be zero"));
         }
         // A sine of the angle below 1e-6 leaves no digits for the image's horizontal axis in single precision.
         if axis.normalize().cross(up.as_dvec3().normalize()).length() < 1e-6 {
-            return Err(self.wrong(&raw.up, "camera.up", "is parallel to the view axis (camera.eye to camera.target)"));
+            return Err(self.wrong(
+                &raw.up,
+                "camera.up",
+                "is parallel to the view axis (camera.eye to camera.target)",
+            ));
         }
         if let Some(distance) = &raw.focus_distance {
             self.positive(distance, "camera.focus_distance")?;
@@ -322,7 +335,8 @@ impl Check<'_> {
 
         let reflectance = raw.reflectance.as_ref().map(|value| self.reflectance(value, &key("reflectance")));
         let reflectance = reflectance.transpose()?;
-        let specular = raw.specular.as_ref().map(|value| self.reflectance(value, &key("specular"))).transpose()?;
+        let specular =
+            raw.specular.as_ref().map(|value| self.reflectance(value, &key("specular"))).transpose()?;
         let ior = raw.ior.as_ref().map(|value| self.positive(value, &key("ior"))).transpose()?;
         let fresnel = self.fresnel(raw, &key)?;
         self.roughness(raw, kind, &key)?;
@@ -342,7 +356,8 @@ impl Check<'_> {
             }
             _ => Surface::instead_of(kind, GREY),
         };
-        let emission = raw.emission.as_ref().map(|value| self.radiance(value, &key("emission"))).transpose()?;
+        let emission =
+            raw.emission.as_ref().map(|value| self.radiance(value, &key("emission"))).transpose()?;
         Ok(Surface { emission: emission.unwrap_or(Vec3::ZERO), ..surface })
     }
 
@@ -367,8 +382,13 @@ impl Check<'_> {
         ];
         for (name, span) in given {
             if let (Some(span), false) = (span, allowed.contains(&name)) {
-                let reason = format!("does not belong to type \"{kind}\" (which takes {})", allowed.join(", "));
-                return Err(SceneError::Value { place: self.source.offset(span.start), key: key(name), reason });
+                let reason =
+                    format!("does not belong to type \"{kind}\" (which takes {})", allowed.join(", "));
+                return Err(SceneError::Value {
+                    place: self.source.offset(span.start),
+                    key: key(name),
+                    reason,
+                });
             }
         }
         Ok(())
@@ -389,7 +409,12 @@ impl Check<'_> {
         }
     }
 
-    fn roughness(&self, raw: &RawMaterial, kind: &str, key: &impl Fn(&str) -> String) -> Result<(), SceneError> {
+    fn roughness(
+        &self,
+        raw: &RawMaterial,
+        kind: &str,
+        key: &impl Fn(&str) -> String,
+    ) -> Result<(), SceneError> {
         if let Some(distribution) = &raw.distribution
             && !["ggx", "beckmann"].contains(&distribution.get_ref().as_str())
         {
