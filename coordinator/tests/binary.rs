@@ -1,5 +1,7 @@
 //! `farm-coordinator` as a process: ready line, signals, exit codes.
 
+#![allow(clippy::unwrap_used, reason = "a test that cannot go on panics")]
+
 use std::{
     io::{BufRead as _, BufReader},
     process::{Child, ChildStderr, ChildStdout, Command, Stdio},

@@ -1,5 +1,7 @@
 //! An embedded coordinator over loopback: real gRPC sessions, the operator's requests, HTTP, lives and ports.
 
+#![allow(clippy::unwrap_used, reason = "a test that cannot go on panics")]
+
 use std::{
     io::{Read as _, Write as _},
     net::{SocketAddr, TcpStream},

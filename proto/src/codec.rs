@@ -218,12 +218,15 @@ mod tests {
 
     fn program(data: &[u8], launches: u32) -> JobProgram {
         let mut program = JobProgram::default();
-        let size_bytes = (data.len() as u64).next_multiple_of(4).max(4);
-        let module = Content { hash: content_hash(data), size_bytes };
+        let mut data = data.to_vec();
+        data.resize(data.len().next_multiple_of(4).max(4), 0);
+        let size_bytes = data.len() as u64;
+        let module = Content { hash: content_hash(&data), size_bytes };
         let buffer = program.malloc(size_bytes).unwrap();
         let input = program.task_allocation(module);
         let kernel = program.function_with_constants(module, "main", &[("tile", 8.5)]);
-        program.memcpy_htod(kernel, "camera", data).unwrap();
+        program.memcpy_htod(kernel, "camera", &data[..4]).unwrap();
+        program.memcpy_htod_buffer(buffer, 0, &data).unwrap();
         program.param_in(kernel, 0, input).unwrap();
         program.param_in_out(kernel, 1, buffer).unwrap();
         for launch in 1..=launches {

@@ -1,5 +1,7 @@
 //! Every message of the control plane survives its way over the wire, and what is not allowed is refused by field.
 
+#![allow(clippy::unwrap_used, reason = "a test that cannot go on panics")]
+
 use std::fmt;
 
 use farm_core::{

@@ -60,8 +60,7 @@ pub(super) async fn fetch(shared: Arc<Shared>, content: Content) -> Result<Bytes
     };
     let lost = |_| FetchError::Link(shared.error());
     // Waits while FETCH_STREAMS are on the way.
-    let (mut request, mut answer) =
-        shared.connection.open_bi().await.map_err(|error| LinkError::from(error))?;
+    let (mut request, mut answer) = shared.connection.open_bi().await.map_err(LinkError::from)?;
     let mut buffer = BytesMut::with_capacity(REQUEST_BYTES);
     buffer.put_slice(&hash.0);
     buffer.put_u64_le(content.size_bytes);

@@ -105,7 +105,8 @@ impl TryFrom<v1::PlanRequest> for PlanRequest {
         if !(costs.len() <= 1 || costs.len() == count) {
             return Err(invalid("PlanRequest.cost_ns", format!("{} costs for {count} jobs", costs.len())));
         }
-        let cost_of = |position: usize| CostNs(costs.get(position).or(costs.first()).copied().unwrap_or(0));
+        let cost_of =
+            |position: usize| CostNs(costs.get(position).or_else(|| costs.first()).copied().unwrap_or(0));
         let mut column = IndexColumn::default();
         let jobs = wire.index_deltas.into_iter().enumerate().map(|(position, delta)| {
             Ok(PlanJob { index: column.next("PlanRequest.index_deltas", delta)?, cost: cost_of(position) })
