@@ -362,8 +362,9 @@ fn eye_samples_and_first_hits_equal_the_twins() {
         }
         let count = layer.pixels.len();
         println!("{name}: {strays} samples and {stray_hits} first hits of {count} stray");
-        // A path of thirty rays meets an edge or a threshold in one of some hundred samples.
-        assert!(strays <= count / 50, "{name}: {strays} of {count} samples differ");
+        // Twenty rays a sample, each as likely to branch otherwise as a probe's lane: at most one in a hundred samples.
+        // Measured: none on lavapipe and on an H200.
+        assert!(strays <= count / 100, "{name}: {strays} of {count} samples differ");
         assert!(stray_hits <= count / 200, "{name}: {stray_hits} of {count} first hits differ");
         assert!(noticed > count / 4, "{name}: another sample's twin is noticed in only {noticed} pixels");
     }

@@ -158,8 +158,11 @@ fn connect(
     }
 }
 
-/// Traces a candidate's shadow ray.
+/// Traces a candidate's shadow ray if it carries anything.
 fn resolve(scene: &TwinScene, strategy: Strategy, candidate: &Candidate, tally: &mut impl Tally) {
+    if candidate.value.max_element() <= 0.0 {
+        return;
+    }
     tally.ray();
     let hit = trace(scene, candidate.origin, candidate.direction, candidate.t_max, Search::Any);
     if hit.triangle == NO_HIT {

@@ -40,6 +40,7 @@ pub fn light(scene: &TwinScene, path: u64, seed: u64, tally: &mut impl SplatTall
         walk_arrive(&mut walk, &surface, hit.t);
         if !is_delta(material)
             && let Some((candidate, pixel)) = connect_to_camera(scene, &walk, &surface, material)
+            && candidate.value.max_element() > 0.0
         {
             tally.ray();
             let hit = trace(scene, candidate.origin, candidate.direction, candidate.t_max, Search::Any);

@@ -128,6 +128,9 @@ pub fn walk_scatter(
         }
     };
     let mut throughput = walk.throughput * factor;
+    if throughput.max_element() <= 0.0 {
+        return false;
+    }
     if walk.edges >= scene.frame.roulette_edges {
         let survival = (throughput.max_element() / walk.strength).min(1.0);
         if u.w >= survival {

@@ -81,6 +81,9 @@ fn walk_scatter(
         return false;
     }
     var throughput = (*walk).throughput * scatter.factor;
+    if max_component(throughput) <= 0.0 {
+        return false;
+    }
     if (*walk).edges >= frame.roulette_edges {
         let survival = min(1.0, max_component(throughput) / (*walk).strength);
         if u.w >= survival {
