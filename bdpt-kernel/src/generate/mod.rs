@@ -118,7 +118,8 @@ impl FromStr for SceneKind {
     fn from_str(name: &str) -> Result<Self, UnknownScene> {
         let unknown = || UnknownScene { name: name.to_owned() };
         match name {
-            "cornell-box" => Ok(Self::CornellBox(CornellVariant::Diffuse)),
+            // The short name is what the README and most people type.
+            "cornell" | "cornell-box" => Ok(Self::CornellBox(CornellVariant::Diffuse)),
             "cornell-box-mirror" => Ok(Self::CornellBox(CornellVariant::Mirror)),
             "cornell-box-glass" => Ok(Self::CornellBox(CornellVariant::Glass)),
             "cornell-box-spheres" => Ok(Self::CornellBox(CornellVariant::Spheres)),
