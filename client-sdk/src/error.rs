@@ -39,7 +39,7 @@ pub enum FarmError {
         reason: String,
     },
     /// The coordinator was lost during a run and did not come back in time.
-    #[error("coordinator {address} was lost and did not come back within {waited:?}: {reason}")]
+    #[error("coordinator {address} was lost and did not come back within {waited:.1?}: {reason}")]
     CoordinatorLost {
         /// Who.
         address: String,
@@ -49,7 +49,7 @@ pub enum FarmError {
         reason: String,
     },
     /// No device of the farm can take the jobs, and none came within the patience.
-    #[error("task `{task}` has waited {waited:?} for a device: {}", describe_wait(*reason))]
+    #[error("task `{task}` has waited {waited:.1?} for a device: {}", describe_wait(*reason))]
     NoFittingDevice {
         /// The task.
         task: String,

@@ -397,6 +397,39 @@ async fn a_lost_coordinator_ends_the_run_after_a_while() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_coordinator_that_comes_back_is_found_again() {
+    let state = tempfile::tempdir().unwrap();
+    let options =
+        CoordinatorOptions { state: Some(state.path().to_owned()), ..CoordinatorOptions::embedded() };
+    let coordinator = coordinator::start(options.clone()).await.unwrap();
+    let address = coordinator.grpc_addr();
+    let mut farm = TestFarm { coordinator, workers: Vec::new() };
+    farm.add_worker(&["sim"], |options| options).await;
+    let app = farm.connect().await;
+    let brought = Brought::default();
+    // 20 ms each; the second task needs a plan of the coordinator that came back.
+    let cost = CostNs(20_000_000);
+    let first =
+        Echoes { jobs: 30, cost, module: module(), brought: Arc::clone(&brought), ..Echoes::default() };
+    let second = Echoes { jobs: 5, brought: Arc::clone(&brought), ..Echoes::default() };
+    let graph = TaskGraph::new().task("first", first).task("second", second).after("second", "first");
+    let mut progress = app.progress();
+    let TestFarm { coordinator, workers } = farm;
+    let restart = async {
+        progress.wait_for(|progress| progress.jobs_done >= 3).await.unwrap();
+        coordinator.shutdown().await;
+        coordinator::start(CoordinatorOptions { listen: address, ..options }).await.unwrap()
+    };
+    let (outcome, coordinator) = tokio::join!(app.run(graph), restart);
+    assert_eq!(outcome.unwrap().jobs, 35);
+    let brought = brought.lock().unwrap().clone();
+    let expected: Vec<u32> = (0..30).chain(0..5).collect();
+    assert_eq!(brought, expected, "one device runs them in order, and none again");
+    app.close().await;
+    TestFarm { coordinator, workers }.stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_dropped_run_and_a_closed_farm_leave_nothing_behind() {
     let farm = TestFarm::simulated().await;
     let app = farm.connect().await;
