@@ -13,6 +13,7 @@ impl CoordinatorMachine {
     pub(super) fn app_heard(&mut self, now: Instant, id: AppId) {
         if let Some(app) = self.apps.get_mut(&id) {
             app.last_heard = now;
+            app.heard = true;
         }
     }
 

@@ -37,6 +37,8 @@ pub(super) struct App {
     pub(super) incarnation: AppIncarnation,
     /// `None` while it is away; then `lease_until` runs.
     pub(super) link: Option<LinkId>,
+    /// It said something since it was told its incarnation.
+    pub(super) heard: bool,
     pub(super) last_heard: Instant,
     pub(super) lease_until: Instant,
     /// Batches with jobs in `jobs`.

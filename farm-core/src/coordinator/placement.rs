@@ -51,7 +51,6 @@ impl CoordinatorMachine {
             let (batch, task) = (request.batch, request.task);
             self.fresh.push_back(Pending { app: id, task, batch, answers: Some(batch), keys });
         }
-        self.repeat_plan(id, Some(request.batch), &intake.placed);
         for key in intake.failed {
             self.repeat_failure(id, key);
         }
@@ -87,12 +86,12 @@ impl CoordinatorMachine {
         let placed = |job: &Job| matches!(job.state, JobState::Placed(_));
         let keys: Vec<JobKey> = app.jobs.iter().filter(|(_, job)| placed(job)).map(|(&key, _)| key).collect();
         for chunk in keys.chunks(MAX_REPEATED_JOBS) {
-            self.repeat_plan(id, None, chunk);
+            self.repeat_plan(id, chunk);
         }
     }
 
     /// Says again where these jobs are, as far as they have a place.
-    pub(super) fn repeat_plan(&mut self, id: AppId, batch: Option<BatchId>, keys: &[JobKey]) {
+    pub(super) fn repeat_plan(&mut self, id: AppId, keys: &[JobKey]) {
         let Some(app) = self.apps.get(&id) else { return };
         let mut grouped: BTreeMap<NodeId, BTreeMap<DeviceIndex, Vec<JobAttempt>>> = BTreeMap::new();
         for &key in keys {
@@ -103,7 +102,7 @@ impl CoordinatorMachine {
         let nodes: Vec<NodePlan> =
             grouped.into_iter().filter_map(|(node, devices)| self.node_plan(node, devices)).collect();
         if !nodes.is_empty() {
-            self.tell_app(id, CoordinatorToApp::Plan(Plan { batch, nodes }));
+            self.tell_app(id, CoordinatorToApp::Plan(Plan { batch: None, nodes }));
         }
     }
 
@@ -271,7 +270,6 @@ struct Candidate {
 struct Intake {
     known_batch: bool,
     fresh: Vec<JobKey>,
-    placed: Vec<JobKey>,
     failed: Vec<JobKey>,
 }
 
@@ -284,9 +282,9 @@ fn take_in(app: &mut App, request: &PlanRequest) -> Intake {
             intake.failed.push(key);
             continue;
         }
-        match app.jobs.get(&key).map(|job| job.state) {
-            Some(JobState::Placed(_)) => intake.placed.push(key),
-            Some(JobState::Waiting | JobState::Executed { .. }) => {}
+        match app.jobs.get(&key) {
+            // Its place was repeated when the application came back.
+            Some(_) => {}
             None => {
                 let (batch, cost) = (request.batch, planned.cost);
                 app.jobs.insert(key, Job { batch, cost, state: JobState::Waiting, crashes: 0, avoid: None });

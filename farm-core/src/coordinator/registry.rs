@@ -154,6 +154,10 @@ impl CoordinatorMachine {
         if let Some((app, incarnation)) = hello.resume {
             return match self.apps.get(&app) {
                 Some(known) if known.incarnation == incarnation => Ok(Admission::Back(app)),
+                // The welcome that told it of its new incarnation got lost.
+                Some(known) if !known.heard && known.incarnation.0 == incarnation.0.saturating_add(1) => {
+                    Ok(Admission::Back(app))
+                }
                 Some(known) => Err(format!("{app} {incarnation} is over, {} is there", known.incarnation)),
                 // Its lease ran out, or an earlier coordinator knew it: it keeps its name, its jobs are asked for anew.
                 None if self.issued(app) => {
@@ -205,6 +209,7 @@ impl CoordinatorMachine {
             weight: hello.weight,
             incarnation,
             link: Some(link),
+            heard: false,
             last_heard: now,
             lease_until: now,
             batches: BTreeMap::new(),

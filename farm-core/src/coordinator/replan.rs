@@ -146,7 +146,7 @@ impl CoordinatorMachine {
             }
         }
         for (app, keys) in by_app {
-            self.repeat_plan(app, None, &keys);
+            self.repeat_plan(app, &keys);
         }
     }
 

@@ -44,8 +44,6 @@ pub(super) struct Batch {
     pub(super) waiting_jobs: u32,
     /// The coordinator of this session has been asked.
     pub(super) requested: bool,
-    /// Ask also for jobs that have a plan: the coordinator lost it.
-    pub(super) ask_all: bool,
 }
 
 impl Ledger {
@@ -172,15 +170,7 @@ impl Ledger {
         let id = BatchId(self.next_batch);
         self.next_batch += 1;
         let open_jobs = u32::try_from(indices.len()).expect("a batch holds at most MAX_BATCH_JOBS");
-        let batch = Batch {
-            task,
-            needs,
-            indices,
-            open_jobs,
-            waiting_jobs: open_jobs,
-            requested: false,
-            ask_all: false,
-        };
+        let batch = Batch { task, needs, indices, open_jobs, waiting_jobs: open_jobs, requested: false };
         self.batches.insert(id, batch);
         self.to_request.push_back(id);
     }

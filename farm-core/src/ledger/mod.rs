@@ -235,6 +235,10 @@ impl Ledger {
     /// Takes one event in.
     pub fn handle(&mut self, now: Instant, event: Event) {
         if self.session == Session::Finished {
+            // A result may have been on its way when we said goodbye.
+            if let Event::FromNode { message: NodeToApp::Result(header), .. } = event {
+                self.push(Effect::DropPayload { job: header.job, digest: header.digest });
+            }
             return;
         }
         match event {

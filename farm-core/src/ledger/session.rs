@@ -150,23 +150,16 @@ impl Ledger {
         self.liveness = liveness;
         self.session = Session::Registered { next_heartbeat: self.heartbeat_after(now) };
         let before = self.identity.replace(identity);
-        // Another incarnation means that the coordinator knows none of our jobs: ask for all of them again. Their
-        // attempts stay valid until larger ones come, so a result on its way is not lost.
-        let forgotten = before != Some(identity);
         if before.is_some_and(|before| before.app != identity.app) {
             // Attempts of another application id can never be answered: nodes hold them under the old id.
             self.unplace_all();
         }
-        self.to_request.clear();
-        for (&id, batch) in &mut self.batches {
-            batch.ask_all |= forgotten;
-            if !batch.ask_all && batch.waiting_jobs == 0 {
-                continue;
-            }
-            self.to_request.push_back(id);
-            if std::mem::take(&mut batch.requested) {
-                self.requested_jobs -= u64::from(batch.open_jobs);
-            }
+        // Whatever was asked before may have got lost, or the coordinator may be another one: ask for every open job
+        // (again). What it knows stays as it is; attempts stay valid until larger ones come, so no result is lost.
+        self.to_request = self.batches.keys().copied().collect();
+        self.requested_jobs = 0;
+        for batch in self.batches.values_mut() {
+            batch.requested = false;
         }
         self.say_unreachable_again();
     }
@@ -181,14 +174,10 @@ impl Ledger {
             batch.requested = true;
             self.requested_jobs += u64::from(batch.open_jobs);
         }
-        let ask_all = std::mem::take(&mut batch.ask_all);
         let mut jobs = Vec::with_capacity(batch.indices.len());
         let mut contents: BTreeSet<Content> = BTreeSet::new();
         for &index in &batch.indices {
             let Some(job) = self.jobs.get(&JobKey { task: batch.task, index }) else { continue };
-            if job.place.is_some() && !ask_all {
-                continue;
-            }
             jobs.push(PlanJob { index, cost: job.cost });
             if contents.len() < MAX_REQUEST_CONTENTS {
                 contents.extend(&job.contents);

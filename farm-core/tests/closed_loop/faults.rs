@@ -37,6 +37,8 @@ pub(crate) enum Fault {
     Cut { app: usize, worker: usize },
     /// They can again.
     Mend { app: usize, worker: usize },
+    /// The coordinator dies, and another one takes its place.
+    NewCoordinator,
     /// No fault follows.
     Calm,
 }
@@ -98,6 +100,7 @@ impl World {
             Fault::Mend { app, worker } => {
                 self.cuts.remove(&(app, worker));
             }
+            Fault::NewCoordinator => self.restart_coordinator(),
             Fault::Calm => {
                 self.work.crash_one_in = 0;
                 self.work.fetch_fails_one_in = 0;
@@ -110,7 +113,7 @@ impl World {
     /// Draws which kinds of faults this seed has, and when they come. Worker 0 stays, whole, for the others' jobs.
     pub(crate) fn schedule_faults(&mut self, until: Instant) {
         let apps = self.apps.len();
-        for kind in 0..10 {
+        for kind in 0..11 {
             if self.rng.random_bool(0.5) {
                 continue;
             }
@@ -135,6 +138,7 @@ impl World {
                         self.at(at.after(millis), Happening::Fault(Fault::Mend { app, worker }));
                         Fault::Cut { app, worker }
                     }
+                    9 => Fault::NewCoordinator,
                     _ => {
                         self.work.crash_one_in = 20;
                         self.work.fetch_fails_one_in = 4;

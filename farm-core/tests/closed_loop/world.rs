@@ -180,7 +180,7 @@ impl World {
     }
 
     pub(crate) fn at(&mut self, at: Instant, happening: Happening) {
-        self.queue.insert((at, self.next_happening), happening);
+        self.queue.insert((at.max(self.now), self.next_happening), happening);
         self.next_happening += 1;
     }
 
