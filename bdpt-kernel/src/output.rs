@@ -12,11 +12,18 @@ use std::{
     process,
 };
 
-use exr::prelude::{AnyChannel, AnyChannels, Encoding, FlatSamples, WritableImage};
+use exr::prelude::{
+    AnyChannel, AnyChannels, Blocks, Compression, Encoding, FlatSamples, LineOrder, WritableImage,
+};
 use image::{ExtendedColorType, ImageEncoder, codecs::png::PngEncoder};
 use thiserror::Error;
 
 use crate::film::Image;
+
+/// Lossless and quick. ZIP saves a tenth of noisy floats and took 9.1 s for 1920x1152 on one core against 0.8 s, as long as a GPU takes to
+/// render it.
+const ENCODING: Encoding =
+    Encoding { compression: Compression::RLE, blocks: Blocks::ScanLines, line_order: LineOrder::Increasing };
 
 /// What kind of file an image becomes, by its name's extension.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -206,7 +213,7 @@ fn write_exr(file: &mut File, image: &Image) -> Result<(), String> {
     channels.push(channel("samples.N", FlatSamples::U32(image.samples.clone())));
     let size = (image.size.width_px as usize, image.size.height_px as usize);
     let list = AnyChannels::sort(channels.into_iter().collect());
-    let exr = exr::image::Image::from_encoded_channels(size, Encoding::SMALL_LOSSLESS, list);
+    let exr = exr::image::Image::from_encoded_channels(size, ENCODING, list);
     exr.write().non_parallel().to_buffered(BufWriter::new(file)).map_err(|error| error.to_string())
 }
 

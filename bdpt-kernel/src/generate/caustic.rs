@@ -29,7 +29,7 @@ Ni 1.5
 illum 7
 newmtl lamp
 Kd 0 0 0
-Ke 260 240 210
+Ke 650 600 525
 ";
 
 /// Glass must not touch the floor, or the two surfaces would be one.
