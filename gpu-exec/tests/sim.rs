@@ -1,5 +1,7 @@
 //! Simulated devices: the order of events, never their durations.
 
+#![allow(clippy::unwrap_used, reason = "a test that cannot go on panics")]
+
 use std::{
     sync::{Arc, mpsc},
     time::Duration,

@@ -59,6 +59,9 @@ async fn read(
     }
 }
 
+/// Frames that wait, in order; `None` while none does and nobody forwards.
+type Backlog = Mutex<Option<VecDeque<(NodeToApp, Vec<Bytes>)>>>;
+
 /// The writing side of a link: straight into its queue while that has room, else over a backlog that a task of its own
 /// works off in order.
 #[derive(Debug)]
@@ -67,7 +70,7 @@ pub(crate) struct Outbox {
     /// `Some` while frames wait. A lock, not messages: the forwarder must end and the owner must see that it ended in
     /// one step, or a frame could be left behind. Held for a push or a pop. At most one result of each job held
     /// waits here (`MAX_JOBS`).
-    backlog: Arc<Mutex<Option<VecDeque<(NodeToApp, Vec<Bytes>)>>>>,
+    backlog: Arc<Backlog>,
 }
 
 impl Outbox {
@@ -103,10 +106,7 @@ impl Outbox {
     }
 }
 
-async fn forward(
-    sender: LinkSender<NodeToApp>,
-    backlog: Arc<Mutex<Option<VecDeque<(NodeToApp, Vec<Bytes>)>>>>,
-) {
+async fn forward(sender: LinkSender<NodeToApp>, backlog: Arc<Backlog>) {
     loop {
         let next = {
             let mut backlog = backlog.lock().unwrap_or_else(PoisonError::into_inner);

@@ -141,3 +141,48 @@ fn a_launch_that_cannot_be_cut_costs_the_device_and_only_its_own_job() {
     let (program, contents) = spin(long, false);
     assert!(device.run_program(program, &contents).is_ok());
 }
+
+#[test]
+#[ignore = "prints a figure for people: how much of the wall time of a sliced job the device works"]
+fn measure_how_busy_slices_keep_the_device() {
+    let device = TestDevice::open();
+    let info = device.executor.info();
+    println!("{}: score {:.0} GFLOP/s", info.name, info.score);
+    // The scratch of a real kernel bounds its slices; 16 layers of 64 workgroups is what a small tile has.
+    for (x, layers) in [(64, 2_000), (1_024, 2_000)] {
+        let layers = if info.kind == farm_core::device::DeviceKind::Gpu { 8 * layers } else { layers / 100 };
+        for _ in 0..2 {
+            let (program, contents) = spin([x, 1, layers], true);
+            let order = device.order(program, &contents);
+            let job = order.job;
+            let begin = std::time::Instant::now();
+            device.executor.submit(order).unwrap();
+            let (device_time_ns, outcome) = device.finished(job);
+            let wall = begin.elapsed();
+            outcome.unwrap();
+            let busy = Duration::from_nanos(device_time_ns);
+            println!(
+                "{x} x {layers} workgroups: wall {wall:?}, device {busy:?}, {:.3}",
+                busy.as_secs_f64() / wall.as_secs_f64()
+            );
+        }
+    }
+    // Small jobs one after the other, one staged: what a job costs beside its work.
+    let begin = std::time::Instant::now();
+    let count = 200;
+    let (mut submitted, mut ended) = (0, 0);
+    while ended < count {
+        while submitted < count {
+            let (program, contents) = spin([1, 1, 1], false);
+            if device.executor.submit(device.order(program, &contents)).is_err() {
+                break;
+            }
+            submitted += 1;
+        }
+        if let ExecutorEvent::Finished { outcome, .. } = device.next_event() {
+            outcome.unwrap();
+            ended += 1;
+        }
+    }
+    println!("{count} small jobs: {:?} each", begin.elapsed() / count);
+}
