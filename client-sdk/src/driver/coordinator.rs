@@ -62,6 +62,11 @@ impl Coordinator {
         matches!(self.state, State::Up(_)) && self.serial == serial
     }
 
+    /// Whether a new session is wanted: a try may end after the farm was given up.
+    pub(super) const fn is_trying(&self) -> bool {
+        matches!(self.state, State::Trying)
+    }
+
     pub(super) const fn is_lost(&self) -> bool {
         self.loss.is_some()
     }
@@ -89,13 +94,8 @@ impl Coordinator {
         }
     }
 
-    /// The session ended.
-    pub(super) fn lost(&mut self, error: &SessionError, now: Instant) {
-        self.try_failed(error, now);
-    }
-
     /// A try gave no session, or the session is over: waits before the next.
-    pub(super) fn try_failed(&mut self, error: &SessionError, now: Instant) {
+    pub(super) fn lost(&mut self, error: &SessionError, now: Instant) {
         if matches!(self.state, State::GivenUp) {
             return;
         }
@@ -177,7 +177,7 @@ mod tests {
         let gone = SessionError::Ended { reason: "gone".to_owned() };
         let mut pauses = Vec::new();
         for _ in 0..8 {
-            coordinator.try_failed(&gone, start);
+            coordinator.lost(&gone, start);
             let State::BackingOff { until } = coordinator.state else { panic!("a failed try backs off") };
             pauses.push(until - start);
         }

@@ -249,8 +249,11 @@ impl Driver {
             }
             Input::Submitted(submission) => self.submitted(submission),
             Input::RunOver { tasks } => self.run_over(tasks),
-            Input::CoordinatorTried(Ok(session)) => self.coordinator_connected(session),
-            Input::CoordinatorTried(Err(error)) => self.coordinator.try_failed(&error, Instant::now()),
+            Input::CoordinatorTried(outcome) => match outcome {
+                _ if !self.coordinator.is_trying() => {}
+                Ok(session) => self.coordinator_connected(session),
+                Err(error) => self.coordinator.lost(&error, Instant::now()),
+            },
             Input::CoordinatorSaid { serial, message } => {
                 if self.coordinator.is_current(serial) {
                     self.coordinator_said(message);
