@@ -241,8 +241,8 @@ impl CoordinatorMachine {
     /// Takes one event in.
     pub fn handle(&mut self, now: Instant, event: Event) {
         match event {
-            Event::FromApp { link, message } => self.from_app(now, link, message),
-            Event::FromNode { link, message } => self.from_node(now, link, message),
+            Event::FromApp { link, message } => self.app_said(now, link, message),
+            Event::FromNode { link, message } => self.node_said(now, link, message),
             Event::LinkClosed { link } => self.link_closed(now, link),
             Event::DrainRequested { node } => self.drain(node),
         }
@@ -270,13 +270,12 @@ impl CoordinatorMachine {
         self.effects.pop_front()
     }
 
-    fn from_app(&mut self, now: Instant, link: LinkId, message: AppToCoordinator) {
-        let app = match (self.links.get(&link), message) {
+    fn app_said(&mut self, now: Instant, link: LinkId, message: AppToCoordinator) {
+        let (app, message) = match (self.links.get(&link), message) {
             (None, AppToCoordinator::Hello(hello)) => return self.app_hello(now, link, hello),
             (Some(Peer::App(app)), message) => (*app, message),
             (None | Some(Peer::Node(_)), _) => return self.protocol_error(now, link),
         };
-        let (app, message) = app;
         self.app_heard(now, app);
         match message {
             AppToCoordinator::Hello(_) => self.protocol_error(now, link),
@@ -294,13 +293,12 @@ impl CoordinatorMachine {
         }
     }
 
-    fn from_node(&mut self, now: Instant, link: LinkId, message: NodeToCoordinator) {
-        let node = match (self.links.get(&link), message) {
+    fn node_said(&mut self, now: Instant, link: LinkId, message: NodeToCoordinator) {
+        let (node, message) = match (self.links.get(&link), message) {
             (None, NodeToCoordinator::Hello(hello)) => return self.node_hello(now, link, hello),
             (Some(Peer::Node(node)), message) => (*node, message),
             (None | Some(Peer::App(_)), _) => return self.protocol_error(now, link),
         };
-        let (node, message) = node;
         self.node_heard(now, node);
         match message {
             NodeToCoordinator::Hello(_) => self.protocol_error(now, link),

@@ -115,15 +115,15 @@ impl CoordinatorMachine {
         }
         // While its application is away a job could not be sent: it would only fill up a device's queue.
         let candidates =
-            if app.link.is_some() { self.candidates(now, app, &batch.needs) } else { Vec::new() };
-        if candidates.is_empty() {
+            if app.link.is_some() { self.candidates(now, app, &batch.needs) } else { Candidates::default() };
+        if candidates.queues.is_empty() {
             pending.keys = wants.into_iter().map(|want| want.key).collect();
             self.say_waiting(pending.app, pending.batch);
             self.stuck.push_back(pending);
             return;
         }
-        let candidates = self.list_schedule(now, pending.app, &wants, candidates);
-        let nodes = self.enter_plan(candidates);
+        let shares = self.list_schedule(now, pending.app, &wants, candidates);
+        let nodes = self.enter_plan(shares);
         if pending.answers.is_none() {
             self.replanned_jobs += wants.len() as u64;
         }
@@ -131,8 +131,8 @@ impl CoordinatorMachine {
     }
 
     /// Devices that may take jobs of these needs, by node and index.
-    fn candidates(&self, now: Instant, app: &App, needs: &Requirements) -> Vec<Candidate> {
-        let mut candidates = Vec::new();
+    fn candidates(&self, now: Instant, app: &App, needs: &Requirements) -> Candidates {
+        let mut candidates = Candidates::default();
         for (&id, node) in self.nodes.iter().filter(|(_, node)| node.takes_work()) {
             if app.unreachable.get(&id).is_some_and(|until| *until > now) {
                 continue;
@@ -142,11 +142,11 @@ impl CoordinatorMachine {
                     continue;
                 }
                 let time_per_load = 1.0 / device.rate(&self.calibration);
-                candidates.push(Candidate {
+                let free_at = device.queued_ns as f64 * time_per_load;
+                candidates.queues.push(Queue { node: id, free_at, time_per_load });
+                candidates.shares.push(Share {
                     node: id,
                     device: DeviceIndex(index),
-                    free_at: device.queued_ns as f64 * time_per_load,
-                    time_per_load,
                     jobs: Vec::new(),
                     load_ns: 0,
                 });
@@ -161,16 +161,18 @@ impl CoordinatorMachine {
         now: Instant,
         id: AppId,
         wants: &[Want],
-        mut candidates: Vec<Candidate>,
-    ) -> Vec<Candidate> {
-        let Some(app) = self.apps.get_mut(&id) else { return candidates };
+        candidates: Candidates,
+    ) -> Vec<Share> {
+        let Candidates { mut queues, mut shares } = candidates;
+        let Some(app) = self.apps.get_mut(&id) else { return shares };
         for want in wants {
             let Some(job) = app.jobs.get_mut(&want.key) else { continue };
             let load = want.load_ns as f64;
-            let Some(chosen) = earliest_finish(&mut candidates, load, want.avoid) else { continue };
+            let Some(index) = earliest_finish(&queues, load, want.avoid) else { continue };
+            let (queue, chosen) = (&mut queues[index], &mut shares[index]);
             let attempt = Attempt { epoch: self.config.epoch, sequence: self.next_attempt };
             self.next_attempt += 1;
-            chosen.free_at += load * chosen.time_per_load;
+            queue.free_at += load * queue.time_per_load;
             chosen.load_ns += u128::from(want.load_ns);
             chosen.jobs.push(JobAttempt { job: want.key.in_app(id), attempt });
             job.state = JobState::Placed(Placement {
@@ -185,24 +187,25 @@ impl CoordinatorMachine {
                 batch.told = None;
             }
         }
-        candidates
+        shares
     }
 
     /// Books the chosen places on their nodes, and groups them for the application.
-    fn enter_plan(&mut self, candidates: Vec<Candidate>) -> Vec<NodePlan> {
+    fn enter_plan(&mut self, shares: Vec<Share>) -> Vec<NodePlan> {
         let mut plans: Vec<NodePlan> = Vec::new();
-        for candidate in candidates.into_iter().filter(|candidate| !candidate.jobs.is_empty()) {
-            let Some(node) = self.nodes.get_mut(&candidate.node) else { continue };
-            node.jobs.extend(candidate.jobs.iter().map(|job| job.job));
-            if let Some(device) = node.device_mut(candidate.device) {
-                device.queued_ns += candidate.load_ns;
-                device.planned_jobs += candidate.jobs.len() as u64;
+        for share in shares.into_iter().filter(|share| !share.jobs.is_empty()) {
+            let Some(node) = self.nodes.get_mut(&share.node) else { continue };
+            node.jobs.extend(share.jobs.iter().map(|job| job.job));
+            if let Some(device) = node.device_mut(share.device) {
+                device.queued_ns += share.load_ns;
+                device.planned_jobs += share.jobs.len() as u64;
             }
-            let share = DevicePlan { device: candidate.device, jobs: candidate.jobs };
+            let id = share.node;
+            let share = DevicePlan { device: share.device, jobs: share.jobs };
             match plans.last_mut() {
-                Some(plan) if plan.node == candidate.node => plan.devices.push(share),
+                Some(plan) if plan.node == id => plan.devices.push(share),
                 Some(_) | None => plans.push(NodePlan {
-                    node: candidate.node,
+                    node: id,
                     session: node.session,
                     contact: node.contact.clone(),
                     devices: vec![share],
@@ -255,12 +258,25 @@ struct Want {
     avoid: Option<NodeId>,
 }
 
-/// A device that may take jobs, and what it got so far. Times are in nanoseconds from now.
-struct Candidate {
+/// Devices that may take jobs: `queues[i]` and `shares[i]` are one device's. Apart, because every job reads all the
+/// queues and writes one share.
+#[derive(Default)]
+struct Candidates {
+    queues: Vec<Queue>,
+    shares: Vec<Share>,
+}
+
+/// How busy a device is. Times are in nanoseconds from now.
+struct Queue {
     node: NodeId,
-    device: DeviceIndex,
     free_at: f64,
     time_per_load: f64,
+}
+
+/// What a device got so far.
+struct Share {
+    node: NodeId,
+    device: DeviceIndex,
     jobs: Vec<JobAttempt>,
     load_ns: u128,
 }
@@ -326,16 +342,20 @@ fn wanted(app: &App, keys: &[JobKey]) -> Vec<Want> {
 ///
 /// A scan, not a heap: with unequal loads and rates the order of finishes differs from job to job. The scan reads two
 /// numbers per device; see `farm-core/tests/placement_cost.rs` for what it costs at 1,000 devices.
-fn earliest_finish(candidates: &mut [Candidate], load: f64, avoid: Option<NodeId>) -> Option<&mut Candidate> {
-    let finish = |candidate: &Candidate| candidate.free_at + load * candidate.time_per_load;
-    let mut best: Option<(usize, f64)> = None;
-    let mut fallback: Option<(usize, f64)> = None;
-    for (index, candidate) in candidates.iter().enumerate() {
-        let finish = finish(candidate);
-        let slot = if avoid == Some(candidate.node) { &mut fallback } else { &mut best };
-        if slot.is_none_or(|(_, earliest)| finish < earliest) {
-            *slot = Some((index, finish));
+fn earliest_finish(queues: &[Queue], load: f64, avoid: Option<NodeId>) -> Option<usize> {
+    let elsewhere = earliest(queues.iter().enumerate().filter(|(_, queue)| avoid != Some(queue.node)), load);
+    elsewhere.or_else(|| earliest(queues.iter().enumerate(), load))
+}
+
+fn earliest<'queue>(queues: impl Iterator<Item = (usize, &'queue Queue)>, load: f64) -> Option<usize> {
+    let mut best = None;
+    let mut best_finish = f64::INFINITY;
+    for (index, queue) in queues {
+        let finish = queue.free_at + load * queue.time_per_load;
+        if best.is_none() || finish < best_finish {
+            best = Some(index);
+            best_finish = finish;
         }
     }
-    best.or(fallback).and_then(|(index, _)| candidates.get_mut(index))
+    best
 }

@@ -243,13 +243,13 @@ impl Ledger {
         }
         match event {
             Event::CoordinatorConnected => self.coordinator_connected(),
-            Event::FromCoordinator(message) => self.from_coordinator(now, message),
+            Event::FromCoordinator(message) => self.coordinator_said(now, message),
             Event::CoordinatorLost => self.coordinator_lost(),
             Event::Submitted { task, jobs, needs } => self.submitted(task, jobs, needs),
             Event::NodeConnected { node, session } => self.node_connected(now, NodeLife { node, session }),
             Event::NodeLost { node, session } => self.node_lost(now, NodeLife { node, session }),
             Event::FromNode { node, session, message } => {
-                self.from_node(now, NodeLife { node, session }, message)
+                self.node_said(now, NodeLife { node, session }, message)
             }
             Event::Cancelled(task) => self.cancelled(task),
             Event::Finished => self.finished(),

@@ -171,7 +171,7 @@ impl Ledger {
         self.deadlines.insert(life, now.after(Duration::from_millis(pause_ms)));
     }
 
-    pub(super) fn from_node(&mut self, now: Instant, life: NodeLife, message: NodeToApp) {
+    pub(super) fn node_said(&mut self, now: Instant, life: NodeLife, message: NodeToApp) {
         match message {
             NodeToApp::Welcome { node, session } => {
                 if life == (NodeLife { node, session }) {

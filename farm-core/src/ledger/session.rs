@@ -79,7 +79,7 @@ impl Ledger {
         self.already_delivered.clear();
     }
 
-    pub(super) fn from_coordinator(&mut self, now: Instant, message: CoordinatorToApp) {
+    pub(super) fn coordinator_said(&mut self, now: Instant, message: CoordinatorToApp) {
         match message {
             CoordinatorToApp::Welcome { app, incarnation, epoch: _, liveness } => {
                 self.welcomed(now, Identity { app, incarnation }, liveness);

@@ -36,7 +36,7 @@ pub(super) struct App {
 }
 
 impl WorkerMachine {
-    pub(super) fn from_app(&mut self, now: Instant, link: LinkId, message: AppToNode) {
+    pub(super) fn app_said(&mut self, now: Instant, link: LinkId, message: AppToNode) {
         let app = match message {
             AppToNode::Hello { protocol, app, incarnation } => {
                 return self.app_hello(now, link, protocol, app, incarnation);

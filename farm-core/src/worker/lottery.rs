@@ -162,3 +162,159 @@ impl FairShare for Lottery {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use std::collections::VecDeque;
+
+    use proptest::prelude::*;
+    use rand::{Rng as _, SeedableRng as _};
+
+    use super::*;
+
+    const WEIGHTS: [f64; 3] = [3.0, 2.0, 1.0];
+
+    /// What a run of continuously backlogged applications led to.
+    struct Outcome {
+        /// Largest |lag| at any time, in largest charges.
+        worst_lag: f64,
+        /// Largest difference between a share received and a share due.
+        share_error: f64,
+    }
+
+    /// Draws `draws` jobs; each is charged when `in_flight` later ones have been drawn, as on devices with running and
+    /// staged jobs.
+    fn run(
+        gain: f64,
+        draws: usize,
+        in_flight: usize,
+        seed: u64,
+        cost: impl Fn(usize, f64) -> f64,
+    ) -> Outcome {
+        let mut lottery = Lottery::new(gain);
+        let mut rng = SmallRng::seed_from_u64(seed);
+        for (app, weight) in (0..).zip(WEIGHTS) {
+            lottery.join(AppId(app), weight);
+            lottery.wake(AppId(app));
+        }
+        let mut outstanding = VecDeque::new();
+        let mut received = [0.0; 3];
+        let mut worst = 0.0_f64;
+        for _ in 0..draws {
+            let app = lottery.draw(&mut (0..3).map(AppId), &mut rng).unwrap();
+            let index = usize::try_from(app.0).unwrap();
+            outstanding.push_back((app, index, cost(index, rng.random())));
+            if outstanding.len() > in_flight
+                && let Some((app, index, cost)) = outstanding.pop_front()
+            {
+                lottery.charge(app, cost);
+                received[index] += cost;
+                let lag = lottery.entrants.values().map(|entrant| entrant.lag.abs()).fold(0.0, f64::max);
+                worst = worst.max(lag / lottery.largest_charge);
+            }
+        }
+        let total: f64 = received.iter().sum();
+        let share_error = received
+            .iter()
+            .zip(WEIGHTS)
+            .map(|(received, weight)| (received / total - weight / 6.0).abs())
+            .fold(0.0, f64::max);
+        Outcome { worst_lag: worst, share_error }
+    }
+
+    /// Costs that differ between applications by up to 10, and inside one by up to 3.
+    fn unequal(app: usize, random: f64) -> f64 {
+        [0.3, 1.0, 3.0][app] * (0.5 + random)
+    }
+
+    #[test]
+    fn lag_stays_below_five_largest_charges() {
+        for seed in 0..20 {
+            for in_flight in [0, 1] {
+                let equal = run(0.15, 10_000, in_flight, seed, |_, _| 1.0);
+                assert!(equal.worst_lag <= 5.0, "seed {seed}: {} with equal costs", equal.worst_lag);
+                let unequal = run(0.15, 10_000, in_flight, seed, unequal);
+                assert!(unequal.worst_lag <= 5.0, "seed {seed}: {} with unequal costs", unequal.worst_lag);
+            }
+        }
+    }
+
+    #[test]
+    fn without_feedback_the_bound_does_not_hold() {
+        let worst = (0..20).map(|seed| run(0.0, 10_000, 0, seed, |_, _| 1.0).worst_lag).fold(0.0, f64::max);
+        assert!(worst > 20.0, "a pure lottery drifts with the square root of its draws, here to {worst}");
+    }
+
+    #[test]
+    fn shares_are_within_two_percent_after_a_thousand_jobs() {
+        for seed in 0..20 {
+            let outcome = run(0.15, 1_000, 1, seed, unequal);
+            assert!(outcome.share_error <= 0.02, "seed {seed}: {}", outcome.share_error);
+        }
+    }
+
+    #[test]
+    fn who_rests_is_not_owed_what_others_get() {
+        let mut lottery = Lottery::new(0.15);
+        for app in 0..2 {
+            lottery.join(AppId(app), 1.0);
+            lottery.wake(AppId(app));
+        }
+        lottery.charge(AppId(0), 1.0);
+        lottery.rest(AppId(1));
+        let frozen = lottery.entrants[&AppId(1)].lag;
+        (0..100).for_each(|_| lottery.charge(AppId(0), 1.0));
+        assert_eq!(lottery.entrants[&AppId(1)].lag, frozen, "frozen at rest");
+        lottery.entrants.get_mut(&AppId(1)).unwrap().lag = 50.0;
+        lottery.entrants.get_mut(&AppId(0)).unwrap().lag = -50.0;
+        lottery.wake(AppId(1));
+        assert_eq!(lottery.entrants[&AppId(1)].lag, 1.0, "clamped to the largest charge");
+        assert_eq!(lottery.entrants[&AppId(0)].lag, -1.0, "and the sum stays zero");
+    }
+
+    #[test]
+    fn jobs_that_cost_nothing_are_shared_by_weight() {
+        let mut lottery = Lottery::new(0.15);
+        let mut rng = SmallRng::seed_from_u64(1);
+        for (app, weight) in (0..).zip(WEIGHTS) {
+            lottery.join(AppId(app), weight);
+            lottery.wake(AppId(app));
+        }
+        let mut wins = [0_u32; 3];
+        for _ in 0..6_000 {
+            let app = lottery.draw(&mut (0..3).map(AppId), &mut rng).unwrap();
+            lottery.charge(app, 0.0);
+            wins[usize::try_from(app.0).unwrap()] += 1;
+        }
+        // Six standard deviations of a fair draw.
+        assert!(wins[0].abs_diff(3_000) < 240 && wins[2].abs_diff(1_000) < 180, "{wins:?}");
+    }
+
+    proptest! {
+        #[test]
+        fn lags_always_sum_to_zero(steps in prop::collection::vec((0_u8..5, 0_u64..4, 0.0_f64..100.0), 1..200)) {
+            let mut lottery = Lottery::new(0.15);
+            let mut rng = SmallRng::seed_from_u64(7);
+            for (step, app, amount) in steps {
+                let app = AppId(app);
+                let awake = lottery.entrants.get(&app).is_some_and(|entrant| entrant.awake);
+                match step {
+                    0 => lottery.join(app, amount + 0.1),
+                    1 if lottery.entrants.len() > 2 => lottery.leave(app),
+                    2 => lottery.wake(app),
+                    3 => lottery.rest(app),
+                    _ if awake => lottery.charge(app, amount),
+                    _ => {}
+                }
+                let awake: Vec<AppId> =
+                    lottery.entrants.iter().filter(|(_, entrant)| entrant.awake).map(|(&id, _)| id).collect();
+                let drawn = lottery.draw(&mut awake.iter().copied(), &mut rng);
+                prop_assert_eq!(drawn.is_none(), awake.is_empty());
+                if lottery.entrants.len() > 1 {
+                    let sum: f64 = lottery.entrants.values().map(|entrant| entrant.lag).sum();
+                    prop_assert!(sum.abs() < 1e-6, "{sum}");
+                }
+            }
+        }
+    }
+}

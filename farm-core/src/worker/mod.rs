@@ -229,9 +229,9 @@ impl WorkerMachine {
         }
         match event {
             Event::CoordinatorConnected => self.coordinator_connected(),
-            Event::FromCoordinator(message) => self.from_coordinator(now, message),
+            Event::FromCoordinator(message) => self.coordinator_said(now, message),
             Event::CoordinatorLost => self.coordinator_lost(),
-            Event::FromApp { link, message } => self.from_app(now, link, message),
+            Event::FromApp { link, message } => self.app_said(now, link, message),
             Event::AppLinkClosed { link } => self.app_link_closed(now, link),
             Event::ContentReady(content) => self.content_ready(content),
             Event::ContentFailed { content, reason } => self.content_failed(now, content, &reason),
@@ -263,7 +263,7 @@ impl WorkerMachine {
             return None;
         }
         let registered = self.session.next_heartbeat();
-        let reports = registered.and(self.reports.due());
+        let reports = registered.and_then(|_| self.reports.due());
         let apps = self.apps.values().filter_map(|app| app.drop_at).min();
         [registered, reports, self.refetch_at, self.drain.deadline(), apps].into_iter().flatten().min()
     }

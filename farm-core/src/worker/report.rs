@@ -88,7 +88,7 @@ impl Reports {
 
     fn push(&mut self, now: Instant, entry: Entry) {
         self.unsent.push_back(entry);
-        self.due.get_or_insert(now.after(Duration::from_millis(REPORT_MS)));
+        self.due.get_or_insert_with(|| now.after(Duration::from_millis(REPORT_MS)));
         if self.kept() > MAX_KEPT_ENTRIES && self.unconfirmed.pop_front().is_none() {
             self.unsent.pop_front();
         }

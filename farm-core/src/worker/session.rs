@@ -64,7 +64,7 @@ impl WorkerMachine {
         }
     }
 
-    pub(super) fn from_coordinator(&mut self, now: Instant, message: CoordinatorToNode) {
+    pub(super) fn coordinator_said(&mut self, now: Instant, message: CoordinatorToNode) {
         match message {
             CoordinatorToNode::Welcome { node, epoch: _, liveness } => {
                 if self.session != Session::Greeting {

@@ -45,15 +45,18 @@ fn jobs(count: u32, known_cost: bool) -> Vec<SubmittedJob> {
             index: JobIndex(index),
             cost: CostNs(if known_cost { cost_ns(JobIndex(index)) } else { 0 }),
             priority: Priority(i32::from(index % 7 == 0)),
-            contents: vec![content(1), content(u8::try_from(2 + index % 3).unwrap())],
+            contents: vec![content(1), content(u8::try_from(2 + index % 3).expect("small"))],
         })
         .collect()
 }
 
 fn submit(world: &mut World, at_ms: u64, app: usize, task: u32, count: u32) {
-    world.apps[app].expected += usize::try_from(count).unwrap();
-    let event =
-        Event::Submitted { task: TaskId(task), jobs: jobs(count, task % 2 == 0), needs: Requirements::ANY };
+    world.apps[app].expected += usize::try_from(count).expect("small");
+    let event = Event::Submitted {
+        task: TaskId(task),
+        jobs: jobs(count, task.is_multiple_of(2)),
+        needs: Requirements::ANY,
+    };
     world.at(Instant(at_ms * MILLISECOND), Happening::App { app, event });
 }
 
@@ -100,7 +103,7 @@ fn stormy(seed: u64) -> World {
             submit(&mut world, at_ms, app, task, count);
         }
     }
-    if seed % 4 == 0 {
+    if seed.is_multiple_of(4) {
         world.at(Instant(700 * MILLISECOND), Happening::App { app: 1, event: Event::Cancelled(TaskId(2)) });
     }
     let until = Instant(3_000 * MILLISECOND);

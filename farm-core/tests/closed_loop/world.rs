@@ -338,19 +338,12 @@ impl World {
     }
 
     pub(crate) fn send(&mut self, from: Proc, id: LinkId, message: Message) {
-        let copies = match (&message, self.duplicate_one_in) {
-            (
-                Message::AppToNode(AppToNode::Jobs(_)) | Message::NodeToApp(NodeToApp::Result(_)),
-                one_in @ 1..,
-            ) => {
-                if self.rng.random_ratio(1, one_in) {
-                    2
-                } else {
-                    1
-                }
-            }
-            _ => 1,
-        };
+        let may_double = matches!(
+            message,
+            Message::AppToNode(AppToNode::Jobs(_)) | Message::NodeToApp(NodeToApp::Result(_))
+        );
+        let one_in = self.duplicate_one_in;
+        let copies = if may_double && one_in > 0 && self.rng.random_ratio(1, one_in) { 2 } else { 1 };
         for _ in 0..copies {
             let latency = self.latency();
             let Some(link) = self.links.get_mut(&id).filter(|link| !link.silent) else { return };
