@@ -51,7 +51,7 @@ fn arguments() -> Result<Arguments, Box<dyn Error>> {
         module: None,
     };
     while let Some(flag) = words.next() {
-        let mut value = || words.next().ok_or(format!("{flag} needs a value"));
+        let mut value = || words.next().ok_or_else(|| format!("{flag} needs a value"));
         match flag.as_str() {
             "--size" => {
                 let size = value()?;
@@ -191,8 +191,11 @@ fn main() -> Result<(), Box<dyn Error>> {
     }
     let wall = start.elapsed().as_secs_f64();
     let _ = bench.finish()?;
-    let light =
-        LightJob { first_path: 0, paths: 2_000_000.min(samples.try_into().unwrap_or(u32::MAX)), seed: 1 };
+    let light = LightJob {
+        first_path: 0,
+        paths: u32::try_from(samples).map_or(2_000_000, |n| n.min(2_000_000)),
+        seed: 1,
+    };
     let mut light_s = 0.0;
     let mut light_rays = 0;
     for _ in 0..3 {

@@ -60,7 +60,7 @@ fn random_path(scene: &TwinScene, number: u32, longest: usize) -> Option<Path> {
         let material = scene.material(&surface);
         let emits = luminance(material.emission.into()) > 0.0 && direction.dot(surface.ng) < 0.0;
         // Every other path goes on past an emitter: emitters also scatter.
-        if emits && surfaces.len() >= 2 && (number % 2 == 0 || surfaces.len() == longest) {
+        if emits && surfaces.len() >= 2 && (number.is_multiple_of(2) || surfaces.len() == longest) {
             return Some(Path { surfaces, end: End::Emitter });
         }
         if surfaces.len() == longest {

@@ -8,8 +8,9 @@ use super::{
 };
 use crate::scene::model::FilmSize;
 
-/// Lanes of one run of the tile kernel, which its scratch memory is sized for: 96 MiB, enough to fill an H200, and
-/// under lavapipe's 128 MiB a binding.
+/// Lanes of one run of the tile kernel, which its scratch memory is sized for: 28 MiB in each of three bindings.
+/// Measured on an H200, kitchen of 1,050,722 triangles: 39 M samples/s of device time with 65,536 lanes, 45 M with
+/// 131,072; 51 M with 524,288 and jobs of 256 samples, at four times the memory.
 pub const LANES_PER_RUN: u32 = 1 << 17;
 
 /// Which strategies make the image.
