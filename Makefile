@@ -1,6 +1,6 @@
 # Everyday commands. `make demo` renders a picture on this machine; `make test` passes every test.
 
-.PHONY: demo test check build bench clean-demo
+.PHONY: demo test check build bench
 
 # Installs what is missing, builds, and renders the Cornell box through an embedded farm.
 demo:
@@ -16,9 +16,10 @@ build:
 # Everything: lints, unit, property, GPU (lavapipe), multi-process, containers (where a Docker daemon answers).
 test:
 	./deploy/setup.sh test
-	cargo nextest run --workspace --locked --features bdpt-kernel/farm
+	cargo build --workspace --bins --examples --locked
+	cargo nextest run --workspace --locked
 	cargo test --workspace --doc --locked --quiet
-	./tests/compose.sh
+	FARMCTL=target/debug/farmctl ./tests/compose.sh
 
 # What a commit must pass besides the tests.
 check:
