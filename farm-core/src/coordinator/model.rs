@@ -54,6 +54,13 @@ pub(super) struct App {
     pub(super) device_time_ns: u64,
 }
 
+impl App {
+    /// A job that waits in line with its batch. Keys stay in line when their jobs go; this tells them apart.
+    pub(super) fn waiting_job(&self, key: JobKey, batch: BatchId) -> Option<&Job> {
+        self.jobs.get(&key).filter(|job| job.state == JobState::Waiting && job.batch == batch)
+    }
+}
+
 /// What the jobs of one plan request share.
 #[derive(Debug)]
 pub(super) struct Batch {
@@ -113,7 +120,6 @@ pub(super) struct Placement {
 #[derive(Debug)]
 pub(super) struct Pending {
     pub(super) app: AppId,
-    pub(super) task: TaskId,
     pub(super) batch: BatchId,
     /// Repeated in the plan: `None` for new attempts after a loss.
     pub(super) answers: Option<BatchId>,
