@@ -24,9 +24,13 @@ mod alignment;
 mod fixed_point;
 mod formats;
 pub mod gpu;
+#[cfg(feature = "farm")]
+pub mod job;
 mod null_model;
+pub mod output;
 mod philox;
 mod reference;
+pub mod saved;
 mod shuffle;
 
 pub use self::{

@@ -131,6 +131,18 @@ impl Shape {
         pair_count(self.l as usize)
     }
 
+    /// Sequences.
+    #[must_use]
+    pub fn rows(&self) -> u32 {
+        self.n
+    }
+
+    /// Size of the alphabet.
+    #[must_use]
+    pub fn symbols(&self) -> u32 {
+        self.q
+    }
+
     /// The parts of the pairs that share bindings.
     #[must_use]
     pub fn chunks(&self) -> &[Chunk] {
