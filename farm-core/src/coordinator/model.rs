@@ -6,10 +6,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use super::NodeState;
 use crate::{
     device::{DeviceInfo, Requirements},
-    id::{
-        AppId, AppIncarnation, Attempt, BatchId, DeviceIndex, JobId, JobKey, LinkId, NodeId, NodeSession,
-        TaskId,
-    },
+    id::{AppId, AppIncarnation, Attempt, BatchId, DeviceIndex, JobId, JobKey, LinkId, NodeId, NodeSession},
     message::{Contact, CostNs, JobFailure, WaitReason},
     time::Instant,
 };
