@@ -128,10 +128,23 @@ fn wrong_usage_is_exit_code_2() {
         vec!["render"],
         vec!["render", "x", "-o", "x.png", "--size", "0x0"],
         vec!["render", "x", "-o", "x.bmp"],
+        vec!["render", "x", "-o", "x.png", "--exposure", "nan"],
+        vec!["--coordinator", "http://127.0.0.1:1", "status"],
     ] {
         let output = farmctl(&arguments);
         assert_eq!(output.status.code(), Some(2), "{arguments:?}: {}", text(&output.stderr));
     }
+}
+
+#[test]
+fn a_farm_of_its_own_that_can_never_render_ends() {
+    let folder = TempDir::new().expect("a temporary folder");
+    let scene = folder.path().join("cornell").display().to_string();
+    assert!(farmctl(["scene", "cornell-box", &scene]).status.success(), "a scene is written");
+    let image = folder.path().join("image.png").display().to_string();
+    let output = farmctl(["render", &scene, "-o", &image, "--spp", "1", "--device", "sim"]);
+    assert_eq!(output.status.code(), Some(1), "{}", text(&output.stderr));
+    assert!(text(&output.stderr).contains("no device"), "{}", text(&output.stderr));
 }
 
 #[test]

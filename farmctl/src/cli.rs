@@ -4,11 +4,13 @@ use std::{path::PathBuf, str::FromStr, time::Duration};
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
 
+use crate::failure::Failure;
+
 /// Gleaner: a GPU compute farm whose idle devices glean work from busy ones.
 #[derive(Debug, Parser)]
 #[command(name = "farmctl", version, disable_version_flag = false)]
 pub(crate) struct Cli {
-    /// The farm's coordinator; without one, `render`, `mi` and `bench` start a farm of their own.
+    /// The farm's coordinator; without one, `render` and `mi` start a farm of their own, as `bench` always does.
     #[arg(long, env = "GLEANER_COORDINATOR", value_name = "HOST:PORT")]
     pub coordinator: Option<String>,
     /// How reads are printed.
@@ -16,6 +18,23 @@ pub(crate) struct Cli {
     pub output: Format,
     #[command(subcommand)]
     pub verb: Verb,
+}
+
+impl Cli {
+    /// The coordinator asked for; an empty variable is none.
+    pub(crate) fn coordinator(&self) -> Result<Option<&str>, Failure> {
+        let Some(address) = self.coordinator.as_deref().filter(|address| !address.is_empty()) else {
+            return Ok(None);
+        };
+        match address.rsplit_once(':') {
+            Some((host, port)) if !host.is_empty() && !host.contains('/') && port.parse::<u16>().is_ok() => {
+                Ok(Some(address))
+            }
+            _ => Err(Failure::Usage(anyhow::anyhow!(
+                "coordinator {address:?} is not HOST:PORT, such as 127.0.0.1:7700"
+            ))),
+        }
+    }
 }
 
 /// How a read is printed.
@@ -49,7 +68,7 @@ pub(crate) enum Verb {
     /// Measure the farm against its bars.
     Bench(BenchArgs),
     /// Print versions.
-    Version,
+    Version(VersionArgs),
 }
 
 #[derive(Debug, Args)]
@@ -82,7 +101,7 @@ pub(crate) struct RenderArgs {
     #[arg(long, default_value_t = 1)]
     pub seed: u64,
     /// Brightness of the PNG in stops.
-    #[arg(long, default_value_t = 0.0, allow_negative_numbers = true)]
+    #[arg(long, default_value_t = 0.0, allow_negative_numbers = true, value_parser = stops)]
     pub exposure: f32,
     /// How progress is told.
     #[arg(long, value_enum, default_value_t = ProgressStyle::Auto)]
@@ -182,6 +201,13 @@ pub(crate) struct BenchArgs {
     pub output: Option<Format>,
 }
 
+#[derive(Debug, Args)]
+pub(crate) struct VersionArgs {
+    /// How they are printed (as before the verb).
+    #[arg(short = 'o', long, value_enum, id = "version_format")]
+    pub output: Option<Format>,
+}
+
 /// A set of figures with their bars (10-scheduling.md section 5).
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub(crate) enum BenchName {
@@ -226,6 +252,18 @@ fn image_path(text: &str) -> Result<PathBuf, String> {
     match extension.as_deref() {
         Some("exr" | "png") => Ok(path),
         _ => Err(format!("{text:?}: the image's name must end in .exr or .png")),
+    }
+}
+
+/// Stops within which any picture is neither black nor white: an f32 has 254.
+const MAX_EXPOSURE: f32 = 64.0;
+
+fn stops(text: &str) -> Result<f32, String> {
+    match text.parse::<f32>() {
+        Ok(exposure) if exposure.abs() <= MAX_EXPOSURE => Ok(exposure),
+        _ => Err(format!(
+            "{text:?}: the exposure must be a number of stops in -{MAX_EXPOSURE}..={MAX_EXPOSURE}"
+        )),
     }
 }
 

@@ -23,11 +23,18 @@ impl Failure {
         })
     }
 
-    /// The cause, for stderr.
-    pub(crate) const fn error(&self) -> &anyhow::Error {
-        match self {
-            Self::Work(error) | Self::Usage(error) | Self::Unreachable(error) => error,
+    /// The causes in one line, for stderr; one whose words are in the one before already is not repeated.
+    pub(crate) fn describe(&self) -> String {
+        let (Self::Work(error) | Self::Usage(error) | Self::Unreachable(error)) = self;
+        let mut text = String::new();
+        for cause in error.chain().map(ToString::to_string) {
+            if text.is_empty() {
+                text = cause;
+            } else if !text.contains(&cause) {
+                text = format!("{text}: {cause}");
+            }
         }
+        text
     }
 }
 

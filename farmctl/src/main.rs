@@ -31,7 +31,7 @@ fn main() -> ExitCode {
     match run(&cli) {
         Ok(()) => ExitCode::SUCCESS,
         Err(failure) => {
-            eprintln!("farmctl: {:#}", failure.error());
+            eprintln!("farmctl: {}", failure.describe());
             failure.exit_code()
         }
     }
@@ -40,7 +40,7 @@ fn main() -> ExitCode {
 fn run(cli: &Cli) -> Result<(), Failure> {
     let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build()?;
     let result = runtime.block_on(async {
-        let coordinator = cli.coordinator.as_deref();
+        let coordinator = cli.coordinator()?;
         match &cli.verb {
             Verb::Up(arguments) => command::up::run(arguments).await,
             Verb::Render(arguments) => Box::pin(command::render::run(arguments, coordinator)).await,
@@ -51,7 +51,7 @@ fn run(cli: &Cli) -> Result<(), Failure> {
             Verb::Bench(arguments) => {
                 Box::pin(bench::run(arguments.name, arguments.output.unwrap_or(cli.output))).await
             }
-            Verb::Version => command::version::run(cli.output),
+            Verb::Version(arguments) => command::version::run(arguments.output.unwrap_or(cli.output)),
         }
     });
     // A device thread or a name look-up may still hang: nothing of it is worth waiting for.

@@ -21,6 +21,9 @@ use crate::{
     running::{Stops, run_graph},
 };
 
+/// How long jobs may wait for a device of the own farm: its worker was registered before.
+const OWN_FARM_PATIENCE: Duration = Duration::from_secs(2);
+
 /// Renders; the exit code is 0 only when every image is complete.
 pub(crate) async fn run(arguments: &RenderArgs, coordinator: Option<&str>) -> Result<(), Failure> {
     let mut stops = Stops::listen()?;
@@ -56,7 +59,11 @@ pub(crate) async fn run(arguments: &RenderArgs, coordinator: Option<&str>) -> Re
         total: plan.total_samples() as f64,
         name: "samples",
     };
-    let farm = FarmOptions::new(&address, app_name(&arguments.scene));
+    let mut farm = FarmOptions::new(&address, app_name(&arguments.scene));
+    if own_farm.is_some() {
+        // Nobody else will join: a device that does not fit now never will.
+        farm.patience = OWN_FARM_PATIENCE;
+    }
     let result = run_graph(farm, graph, arguments.progress, units, &mut stops).await;
     let ended = finish(result, &render, arguments).await;
     if let Some(farm) = own_farm {
@@ -115,11 +122,16 @@ async fn save_partial(render: &RenderHandle, arguments: &RenderArgs) -> Result<(
 async fn write_images(image: Image, arguments: &RenderArgs) -> Result<(), Failure> {
     let paths = arguments.images.clone();
     let tone = Tone { exposure_ev: arguments.exposure };
+    // One that cannot be written must not cost the others.
     let written = tokio::task::spawn_blocking(move || {
-        paths.iter().try_for_each(|path| output::write(path, &image, tone))
+        paths.iter().filter_map(|path| output::write(path, &image, tone).err()).collect::<Vec<_>>()
     });
-    written.await.context("writing the image panicked")??;
-    Ok(())
+    let mut failures = written.await.context("writing the image panicked")?.into_iter();
+    let Some(first) = failures.next() else { return Ok(()) };
+    for failure in failures {
+        eprintln!("farmctl: {failure}");
+    }
+    Err(first.into())
 }
 
 fn tell_summary(summary: &RunSummary, render: &RenderHandle, arguments: &RenderArgs) -> Result<(), Failure> {
