@@ -9,7 +9,7 @@ use std::time::Duration;
 use device::Device;
 use mi_kernel::{
     Alignment, NullModel, Reference, Seed, ShuffleKind,
-    gpu::{MiJob, Pass, Shape},
+    gpu::{Method, MiJob, Pass, Shape},
     parse,
 };
 use proptest::{
@@ -60,6 +60,34 @@ fn random_alignments_give_the_hosts_bits() {
         Ok(())
     });
     outcome.unwrap_or_else(|error| panic!("{error}"));
+}
+
+#[test]
+fn bit_planes_and_histograms_agree() {
+    let device = Device::open(COARSE);
+    for (q, symbols) in (2..=7).map(|q| (q, &b"-ACGTUN"[..q])) {
+        // Past a word of rows and a block of columns, neither full.
+        let mut state = q as u64;
+        let mut text = Vec::new();
+        for _ in 0..101 {
+            for column in 0..259 {
+                state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+                let kinds = 1 + column % q;
+                text.push(symbols[usize::try_from(state >> 40).unwrap() % kinds]);
+            }
+            text.push(b'\n');
+        }
+        let alignment = parse(&text).unwrap().alignment;
+        let reference = Reference::new(&alignment).unwrap();
+        let shape = Shape::with_binding_bytes(&alignment, 100_000).unwrap();
+        assert_eq!((alignment.q(), shape.method() == Method::Planes), (q, q <= 6));
+        assert!(shape.chunks().len() > 1, "several bindings");
+        let host = NullModel::new(&reference, Seed(4), ShuffleKind::Feistel).run(5..7).unwrap();
+        assert!(device.observed(&reference, &shape) == reference.observed(), "{q} symbols, observed");
+        assert!(device.sums(&reference, &shape, &reduce(4, 5..7)) == host, "{q} symbols");
+        let histograms = shape.with_histograms();
+        assert!(device.sums(&reference, &histograms, &reduce(4, 5..7)) == host, "{q} symbols, histograms");
+    }
 }
 
 #[test]

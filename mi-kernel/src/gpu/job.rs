@@ -11,7 +11,7 @@ use thiserror::Error;
 
 use super::{
     layout::{self, KEYS_HEADER, LANES, ROWS_A_LANE, WORDS_A_LANE, binding},
-    pack::{AlignmentContents, Chunk, Shape},
+    pack::{AlignmentContents, Chunk, Method, Shape},
 };
 use crate::{Accumulators, NullModelError, Seed, philox::split};
 
@@ -227,29 +227,47 @@ fn section<T: bytemuck::Pod, B: AsRef<[u8]>>(
 /// The kernels and buffers that all chunks share.
 struct Passes {
     keys: Kernel,
+    /// Writes `rows`.
     shuffle: Kernel,
     round_keys: Buffer,
-    shuffled: Buffer,
-    grouped: Buffer,
+    rows: Rows,
+}
+
+/// One iteration's alignment, as a method counts it.
+enum Rows {
+    Histograms { shuffled: Buffer, grouped: Buffer },
+    Planes(Buffer),
 }
 
 impl Passes {
     fn new(shape: &Shape, contents: &AlignmentContents, cmd: &mut JobProgram) -> Result<Self, DispatchError> {
         let sizes = shape.sizes();
-        let widest = shape.chunks.iter().map(|chunk| chunk.columns).max().unwrap_or(1);
         let round_keys = cmd.malloc((KEYS_HEADER + u64::from(shape.l) * 8) * 4)?;
-        let shuffled = cmd.malloc(u64::from(shape.n) * u64::from(sizes.row_words) * 4)?;
-        let grouped = cmd.malloc(u64::from(widest) * u64::from(sizes.order_words) * 4)?;
         let keys = cmd.function(contents.module, "keys");
         cmd.param_in_out(keys, binding::ROUND_KEYS, round_keys)?;
         cmd.memcpy_htod(keys, "sizes", bytes_of(&sizes))?;
-        let shuffle = cmd.function(contents.module, "shuffle");
+        let (rows, shuffle) = match shape.method {
+            Method::Histograms => {
+                let widest = shape.chunks.iter().map(|chunk| chunk.columns).max().unwrap_or(1);
+                let shuffled = cmd.malloc(u64::from(shape.n) * u64::from(sizes.row_words) * 4)?;
+                let grouped = cmd.malloc(u64::from(widest) * u64::from(sizes.order_words) * 4)?;
+                let shuffle = cmd.function(contents.module, "shuffle");
+                cmd.param_in_out(shuffle, binding::SHUFFLED, shuffled)?;
+                (Rows::Histograms { shuffled, grouped }, shuffle)
+            }
+            Method::Planes => {
+                let words = u64::from(sizes.plane_words) * u64::from(shape.q - 1) * u64::from(shape.l);
+                let planes = cmd.malloc(words * 4)?;
+                let shuffle = cmd.function(contents.module, "planes_of_rows");
+                cmd.param_in_out(shuffle, binding::PLANES, planes)?;
+                (Rows::Planes(planes), shuffle)
+            }
+        };
         let codes = cmd.task_allocation(contents.codes);
         cmd.param_in(shuffle, binding::CODES, codes)?;
         cmd.param_in_out(shuffle, binding::ROUND_KEYS, round_keys)?;
-        cmd.param_in_out(shuffle, binding::SHUFFLED, shuffled)?;
         cmd.memcpy_htod(shuffle, "sizes", bytes_of(&sizes))?;
-        Ok(Self { keys, shuffle, round_keys, shuffled, grouped })
+        Ok(Self { keys, shuffle, round_keys, rows })
     }
 
     fn shuffle(
@@ -261,28 +279,44 @@ impl Passes {
         let sizes = shape.sizes();
         cmd.memcpy_htod(self.keys, "iteration", bytes_of(iteration))?;
         cmd.launch(self.keys, [shape.l.div_ceil(LANES), 1, 1])?;
-        let groups = [sizes.row_words.div_ceil(LANES), 1, shape.n.div_ceil(ROWS_A_LANE)];
+        let groups = match self.rows {
+            Rows::Histograms { .. } => [sizes.row_words.div_ceil(LANES), 1, shape.n.div_ceil(ROWS_A_LANE)],
+            Rows::Planes(_) => [shape.l.div_ceil(LANES), 1, sizes.plane_words],
+        };
         cmd.launch_sliced(self.shuffle, groups, slicing(groups[2]), CostNs(0))
     }
 
-    /// The grouping kernel of a chunk and its counting kernel `entry`, with all that both modes bind.
+    /// The counting kernel of a chunk with all that both modes bind, and the kernel that groups its rows, if it needs
+    /// them grouped.
     fn counter(
         &self,
         shape: &Shape,
         contents: &AlignmentContents,
         (index, chunk): (usize, Chunk),
-        entry: &str,
+        mode: &str,
         cmd: &mut JobProgram,
-    ) -> Result<(Kernel, Kernel), DispatchError> {
+    ) -> Result<(Option<Kernel>, Kernel), DispatchError> {
         let sizes = shape.sizes();
         let (range, _) = shape.range(chunk);
-        let grouped_bytes = u64::from(chunk.columns) * u64::from(sizes.order_words) * 4;
-        let group = cmd.function(contents.module, "group");
-        let order = cmd.task_allocation(contents.orders[index]);
-        cmd.param_in(group, binding::SYMBOL_ORDER, order)?;
-        cmd.param_in_out(group, binding::ROUND_KEYS, self.round_keys)?;
-        cmd.param(group, binding::GROUPED, self.grouped, 0, grouped_bytes, Access::InOut)?;
-        let count = cmd.function(contents.module, entry);
+        let (group, count) = match self.rows {
+            Rows::Histograms { shuffled, grouped } => {
+                let grouped_bytes = u64::from(chunk.columns) * u64::from(sizes.order_words) * 4;
+                let group = cmd.function(contents.module, "group");
+                let order = cmd.task_allocation(contents.orders[index]);
+                cmd.param_in(group, binding::SYMBOL_ORDER, order)?;
+                cmd.param_in_out(group, binding::ROUND_KEYS, self.round_keys)?;
+                cmd.param(group, binding::GROUPED, grouped, 0, grouped_bytes, Access::InOut)?;
+                let count = cmd.function(contents.module, &format!("count_{mode}"));
+                cmd.param_in_out(count, binding::SHUFFLED, shuffled)?;
+                cmd.param(count, binding::GROUPED, grouped, 0, grouped_bytes, Access::InOut)?;
+                (Some(group), count)
+            }
+            Rows::Planes(planes) => {
+                let count = cmd.function(contents.module, &format!("planes_{mode}"));
+                cmd.param_in_out(count, binding::PLANES, planes)?;
+                (None, count)
+            }
+        };
         for (place, content) in [
             (binding::BOUNDS, contents.bounds),
             (binding::TABLE, contents.table),
@@ -291,9 +325,7 @@ impl Passes {
             let buffer = cmd.task_allocation(content);
             cmd.param_in(count, place, buffer)?;
         }
-        cmd.param_in_out(count, binding::SHUFFLED, self.shuffled)?;
-        cmd.param(count, binding::GROUPED, self.grouped, 0, grouped_bytes, Access::InOut)?;
-        for kernel in [group, count] {
+        for kernel in group.into_iter().chain([count]) {
             cmd.memcpy_htod(kernel, "sizes", bytes_of(&sizes))?;
             cmd.memcpy_htod(kernel, "chunk", bytes_of(&range))?;
         }
@@ -309,7 +341,7 @@ impl Passes {
         maxima: Buffer,
         cmd: &mut JobProgram,
     ) -> Result<Counter, DispatchError> {
-        let (group, count) = self.counter(shape, contents, place, "count_reduce", cmd)?;
+        let (group, count) = self.counter(shape, contents, place, "reduce", cmd)?;
         let pairs = u64::from(place.1.pairs);
         let (sums, squares, reached) =
             (cmd.malloc(pairs * 8)?, cmd.malloc(pairs * 8)?, cmd.malloc(pairs * 4)?);
@@ -330,7 +362,7 @@ impl Passes {
         place: (usize, Chunk),
         cmd: &mut JobProgram,
     ) -> Result<Counter, DispatchError> {
-        let (group, count) = self.counter(shape, contents, place, "count_matrix", cmd)?;
+        let (group, count) = self.counter(shape, contents, place, "matrix", cmd)?;
         let scores = cmd.malloc(u64::from(place.1.pairs) * 4)?;
         cmd.param_in_out(count, binding::SCORES, scores)?;
         Ok(Counter { chunk: place.1, group, count, outputs: Outputs::Matrix(scores) })
@@ -340,7 +372,7 @@ impl Passes {
 /// What counts one chunk.
 struct Counter {
     chunk: Chunk,
-    group: Kernel,
+    group: Option<Kernel>,
     count: Kernel,
     outputs: Outputs,
 }
@@ -352,9 +384,10 @@ enum Outputs {
 
 impl Counter {
     fn run(&self, shape: &Shape, cmd: &mut JobProgram) -> Result<(), DispatchError> {
-        let sizes = shape.sizes();
-        let groups = [sizes.order_words.div_ceil(LANES * WORDS_A_LANE), 1, self.chunk.columns];
-        cmd.launch_sliced(self.group, groups, slicing(groups[2]), CostNs(0))?;
+        if let Some(group) = self.group {
+            let groups = [shape.sizes().order_words.div_ceil(LANES * WORDS_A_LANE), 1, self.chunk.columns];
+            cmd.launch_sliced(group, groups, slicing(groups[2]), CostNs(0))?;
+        }
         let (range, z) = shape.range(self.chunk);
         let cost = CostNs(u64::from(self.chunk.pairs) * u64::from(shape.n) / COUNTS_A_NS + 1);
         cmd.launch_sliced(self.count, [range.columns_x, 1, z], slicing(z), cost)

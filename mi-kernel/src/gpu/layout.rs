@@ -19,6 +19,7 @@ pub(super) mod binding {
     pub(crate) const REACHED: u32 = 11;
     pub(crate) const MAXIMA: u32 = 12;
     pub(crate) const SCORES: u32 = 13;
+    pub(crate) const PLANES: u32 = 14;
 }
 
 /// Lanes of every workgroup.
@@ -43,7 +44,7 @@ pub(super) struct Sizes {
     pub(super) order_words: u32,
     pub(super) left_bits: u32,
     pub(super) right_bits: u32,
-    pub(super) padding: u32,
+    pub(super) plane_words: u32,
 }
 
 /// `Chunk` in WGSL. 32 B.

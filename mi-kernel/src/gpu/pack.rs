@@ -18,6 +18,9 @@ const RESULT_BYTES: u64 = 1 << 30;
 /// Bytes of a pair's accumulators: sum, sum of squares, count.
 const PAIR_BYTES: u64 = 20;
 
+/// Alphabets that bit planes are made for.
+pub(super) const PLANES_SYMBOLS: std::ops::RangeInclusive<u32> = 2..=6;
+
 /// Columns i of one cut of a launch at first; more where z would leave its limit.
 const COLUMNS_X: u32 = 16;
 
@@ -72,6 +75,23 @@ pub struct Shape {
     pub(super) l: u32,
     pub(super) q: u32,
     pub(super) chunks: Vec<Chunk>,
+    pub(super) method: Method,
+}
+
+/// How pairs are counted; the scores are the same.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub enum Method {
+    /// A histogram a lane, rows grouped by symbol: the work does not depend on the alphabet.
+    Histograms,
+    /// Bit planes: `(q - 1)^2` operations for 32 rows, for alphabets of 2 to 6 symbols.
+    Planes,
+}
+
+impl Method {
+    /// The quicker one for an alphabet of `q` symbols.
+    fn of(q: u32) -> Self {
+        if PLANES_SYMBOLS.contains(&q) { Self::Planes } else { Self::Histograms }
+    }
 }
 
 fn narrow(value: usize) -> u32 {
@@ -122,7 +142,20 @@ impl Shape {
             }
             first_place += pairs;
         }
-        Ok(Self { n: narrow(n), l: narrow(l), q: narrow(alignment.q()), chunks })
+        let q = narrow(alignment.q());
+        Ok(Self { n: narrow(n), l: narrow(l), q, chunks, method: Method::of(q) })
+    }
+
+    /// The shape with histograms also for a small alphabet: to compare the two.
+    #[must_use]
+    pub fn with_histograms(self) -> Self {
+        Self { method: Method::Histograms, ..self }
+    }
+
+    /// How pairs are counted.
+    #[must_use]
+    pub fn method(&self) -> Method {
+        self.method
     }
 
     /// Pairs of columns.
@@ -160,7 +193,7 @@ impl Shape {
             order_words: self.n.div_ceil(2),
             left_bits: bits / 2,
             right_bits: bits - bits / 2,
-            padding: 0,
+            plane_words: self.n.div_ceil(32),
         }
     }
 

@@ -18,7 +18,7 @@ struct Sizes {
     order_words: u32,
     left_bits: u32,
     right_bits: u32,
-    padding: u32,
+    plane_words: u32,
 }
 
 // Columns i of one launch, and where their pairs begin.
@@ -67,6 +67,8 @@ struct Iteration {
 // Largest score of each iteration, its sign bit turned over so that unsigned order is the order.
 @group(0) @binding(12) var<storage, read_write> maxima: array<atomic<u32>>;
 @group(0) @binding(13) var<storage, read_write> scores: array<i32>;
+// A bit a row: word by word, in it symbol by symbol but the first, in it column by column.
+@group(0) @binding(14) var<storage, read_write> planes: array<u32>;
 
 @group(1) @binding(0) var<uniform> sizes: Sizes;
 @group(1) @binding(1) var<uniform> chunk: Chunk;
