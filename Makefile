@@ -1,5 +1,8 @@
 # Everyday commands. `make demo` renders a picture on this machine; `make test` passes every test.
 
+# Without it Mesa complains on a terminal that has no desktop.
+export XDG_RUNTIME_DIR ?= /tmp
+
 .PHONY: demo test check build bench
 
 # Installs what is missing, builds, and renders the Cornell box through an embedded farm.
