@@ -19,7 +19,8 @@ macro_rules! id {
     };
 }
 
-/// An id that a coordinator issues: its epoch in the upper half, a running number in the lower, both shown.
+/// An id that a coordinator issues: its epoch less one in the upper half, a running number in the lower. Shown as
+/// `epoch.number`, in the first epoch as the number alone.
 macro_rules! issued_id {
     ($(#[$doc:meta])* $name:ident, $prefix:literal) => {
         $(#[$doc])*
@@ -30,7 +31,7 @@ macro_rules! issued_id {
             fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
                 match self.0 >> 32 {
                     0 => write!(f, concat!($prefix, "{}"), self.0),
-                    epoch => write!(f, concat!($prefix, "{}.{}"), epoch, self.0 & 0xffff_ffff),
+                    before => write!(f, concat!($prefix, "{}.{}"), before + 1, self.0 & 0xffff_ffff),
                 }
             }
         }
