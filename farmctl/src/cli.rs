@@ -113,7 +113,7 @@ pub(crate) struct RenderArgs {
 
 #[derive(Debug, Args)]
 pub(crate) struct MiArgs {
-    /// The alignment: FASTA, A3M, A2M, Stockholm, Clustal or one sequence a line.
+    /// The alignment: FASTA, A3M, A2M, Stockholm, Clustal or one sequence a line; gzip too.
     pub alignment: PathBuf,
     /// Where the results go; made if missing.
     #[arg(short = 'o', long = "output", value_name = "FOLDER")]

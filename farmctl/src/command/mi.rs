@@ -2,7 +2,7 @@
 
 use std::{
     fs,
-    io::{self, BufWriter, Write as _},
+    io::{self, BufWriter, Read as _, Write as _},
     path::{Path, PathBuf},
     sync::Arc,
     time::Duration,
@@ -28,6 +28,10 @@ use crate::{
 
 /// Raw sums in the folder: what `--extend` goes on from.
 const SUMS: &str = "sums.bin";
+
+/// Most bytes of an alignment file once decompressed: past what any device holds, short of what a small file can blow
+/// up to.
+const MAX_INPUT_BYTES: u64 = 4 << 30;
 
 /// The alignment as read, and what is known of its file.
 #[derive(Debug)]
@@ -89,7 +93,8 @@ fn shown(path: &Path) -> String {
 /// Reads the alignment and, where asked, the sums to go on from; the folder is there afterwards.
 fn read(arguments: &MiArgs) -> Result<Input, Failure> {
     let bytes = fs::read(&arguments.alignment).with_context(|| shown(&arguments.alignment))?;
-    let parsed = parse(&bytes).with_context(|| shown(&arguments.alignment))?;
+    let text = decompressed(&bytes, MAX_INPUT_BYTES).with_context(|| shown(&arguments.alignment))?;
+    let parsed = parse(text.as_deref().unwrap_or(&bytes)).with_context(|| shown(&arguments.alignment))?;
     eprintln!("farmctl: {}: {}, {}", shown(&arguments.alignment), parsed.notes.format, parsed.alignment);
     if parsed.notes.duplicate_names > 0 {
         eprintln!("farmctl: warning: {} names occur more than once", parsed.notes.duplicate_names);
@@ -116,6 +121,20 @@ fn read(arguments: &MiArgs) -> Result<Input, Failure> {
         blake3: blake3::hash(&bytes).to_hex().to_string(),
         earlier,
     })
+}
+
+/// What a gzip file holds, also one of several members (bgzip); nothing for a file that is none.
+fn decompressed(bytes: &[u8], most_bytes: u64) -> io::Result<Option<Vec<u8>>> {
+    if !bytes.starts_with(&[0x1f, 0x8b]) {
+        return Ok(None);
+    }
+    let mut text = Vec::new();
+    let read = flate2::read::MultiGzDecoder::new(bytes).take(most_bytes + 1).read_to_end(&mut text)?;
+    if read as u64 > most_bytes {
+        let reason = format!("decompressed it is longer than {most_bytes} bytes");
+        return Err(io::Error::new(io::ErrorKind::FileTooLarge, reason));
+    }
+    Ok(Some(text))
 }
 
 /// Writes the results of a complete run, or what there is of an incomplete one.
@@ -263,4 +282,25 @@ fn place(
         let _ = fs::remove_file(&unfinished);
     }
     written.with_context(|| shown(&path))
+}
+
+#[cfg(test)]
+mod tests {
+    use flate2::{Compression, write::GzEncoder};
+
+    use super::*;
+
+    #[test]
+    fn gzip_is_read_within_its_bound() {
+        let gzip = |text: &[u8]| {
+            let mut encoder = GzEncoder::new(Vec::new(), Compression::fast());
+            encoder.write_all(text).unwrap();
+            encoder.finish().unwrap()
+        };
+        let members = [gzip(b">a\nAC\n"), gzip(b">b\nGT\n")].concat();
+        assert_eq!(decompressed(&members, 12).unwrap().as_deref(), Some(&b">a\nAC\n>b\nGT\n"[..]));
+        assert!(decompressed(&members, 11).unwrap_err().to_string().contains("longer than 11 bytes"));
+        assert!(decompressed(&members[..members.len() - 1], 12).is_err(), "cut short");
+        assert_eq!(decompressed(b">a\nAC\n", 12).unwrap(), None);
+    }
 }
