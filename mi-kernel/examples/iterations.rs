@@ -1,6 +1,6 @@
 //! Times iterations of the null model on one device, without a farm: a random alignment of given sizes.
 //!
-//! `cargo run --release -p mi-kernel --example throughput -- [N L Q [ITERATIONS]] [--conserved] [--unchecked]`
+//! `cargo run --release -p mi-kernel --example iterations -- [N L Q [ITERATIONS]] [--conserved] [--unchecked]`
 //!
 //! Without sizes the three sets of the thesis with 21 symbols (45,000 x 1,400; 4,176 x 5,025; 20,000 x 2,189). Prints
 //! one line of JSON a set. The time is the device's, of jobs after a warm-up. `--conserved` gives each column one symbol
