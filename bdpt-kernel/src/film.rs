@@ -91,6 +91,7 @@ pub struct Film {
     held_splats: BTreeMap<u32, SplatLayer>,
     merged_tiles: u64,
     eye_samples: u64,
+    empty_pixels: u64,
     rays: u64,
     counters: Counters,
 }
@@ -106,6 +107,8 @@ pub struct FilmProgress {
     pub light_paths: u64,
     /// Light paths of the whole image.
     pub total_light_paths: u64,
+    /// Pixels without an eye sample, black in the image.
+    pub empty_pixels: u64,
     /// Rays traced for what is merged.
     pub rays: u64,
     /// What the devices had to cut or drop.
@@ -125,7 +128,7 @@ impl FilmProgress {
 pub struct Image {
     /// Its size.
     pub size: FilmSize,
-    /// Radiance: eye and splat together.
+    /// Radiance: eye and splat together; 0 where no eye sample is merged yet.
     pub beauty: Vec<[f32; 3]>,
     /// Part of eye paths (s >= 0, t >= 2).
     pub eye: Vec<[f32; 3]>,
@@ -158,6 +161,7 @@ impl Film {
             held_splats: BTreeMap::new(),
             merged_tiles: 0,
             eye_samples: 0,
+            empty_pixels: plan.size().pixels(),
             rays: 0,
             counters: Counters::default(),
         }
@@ -263,23 +267,31 @@ impl Film {
             total_samples: self.plan.total_samples(),
             light_paths: self.light_paths,
             total_light_paths: self.plan.total_light_paths(),
+            empty_pixels: self.empty_pixels,
             rays: self.rays,
             counters: self.counters,
         }
     }
 
-    /// The image of what is merged.
+    /// The image of what is merged. A pixel without eye samples is black in `beauty`, whatever light paths met it: their
+    /// share alone looks like a picture, and is a wrong one.
     #[must_use]
     pub fn image(&self) -> Image {
         let mean = |sum: f64, count: u64| if count == 0 { 0.0 } else { sum / to_f64(count) };
         let eye = |pixel: &EyePixel| pixel.rgb.map(|sum| mean(sum, pixel.samples));
         let splat = |sums: &[f64; 3]| sums.map(|sum| mean(sum, self.light_paths));
-        let both = self.eye.iter().map(eye).zip(self.splat.iter().map(splat));
+        let beauty = |(pixel, sums): (&EyePixel, &[f64; 3])| {
+            if pixel.samples == 0 {
+                return [0.0; 3];
+            }
+            let (eye, splat) = (eye(pixel), splat(sums));
+            std::array::from_fn(|c| to_f32(eye[c] + splat[c]))
+        };
         let share =
             |sum: f32, count: u32| if count == 0 { 0.0 } else { to_f32(f64::from(sum) / f64::from(count)) };
         Image {
             size: self.plan.size(),
-            beauty: both.map(|(eye, splat)| std::array::from_fn(|c| to_f32(eye[c] + splat[c]))).collect(),
+            beauty: self.eye.iter().zip(&self.splat).map(beauty).collect(),
             eye: self.eye.iter().map(|pixel| eye(pixel).map(to_f32)).collect(),
             splat: self.splat.iter().map(|sums| splat(sums).map(to_f32)).collect(),
             albedo: self.first_hits.iter().map(|hit| hit.albedo.map(|sum| share(sum, hit.samples))).collect(),
@@ -327,6 +339,7 @@ impl Film {
         for (row, (sums, hits)) in rows.enumerate() {
             let at = start + row * width;
             for (pixel, sum) in self.eye[at..at + tile_width].iter_mut().zip(sums) {
+                self.empty_pixels -= u64::from(pixel.samples == 0 && sum.count > 0);
                 add(&mut pixel.rgb, sum.rgb);
                 pixel.luminance += f64::from(sum.luminance);
                 pixel.luminance_squared += f64::from(sum.luminance_squared);
@@ -519,14 +532,32 @@ mod tests {
             let (image, progress) = image_of(all[..count].iter().cloned());
             let splat = if progress.light_paths > 0 { 0.25 } else { 0.0 };
             for (at, beauty) in image.beauty.iter().enumerate() {
-                let eye = if image.samples[at] > 0 { 0.5 } else { 0.0 };
-                assert!((beauty[0] - eye - splat).abs() < 1e-6, "{count} jobs, pixel {at}: {beauty:?}");
+                let expected = if image.samples[at] > 0 { 0.5 + splat } else { 0.0 };
+                assert!((beauty[0] - expected).abs() < 1e-6, "{count} jobs, pixel {at}: {beauty:?}");
             }
         }
         let (image, progress) = image_of(all);
         assert_eq!(progress.samples, 14 * 7_000);
         assert!(image.samples.iter().all(|count| *count == 14), "every pixel has its samples");
         assert_eq!((image.albedo[0], image.normal[0], image.depth[0]), ([0.25; 3], [0.0, 0.0, 1.0], 8.0));
+    }
+
+    #[test]
+    fn pixels_without_eye_samples_are_black_and_counted() {
+        let (lights, tiles): (Vec<Layer>, Vec<Layer>) =
+            layers().into_iter().partition(|layer| matches!(layer, Layer::Splats(..)));
+        let (dark, progress) = image_of(lights.iter().cloned());
+        assert_eq!(progress.empty_pixels, 7_000);
+        assert!(dark.beauty.iter().flatten().all(|value| *value == 0.0), "light paths alone are no picture");
+        assert!(dark.splat.iter().flatten().any(|value| *value != 0.0), "the layer keeps them");
+        let (part, progress) = image_of(lights.iter().chain(&tiles[..1]).cloned());
+        let empty = part.samples.iter().filter(|count| **count == 0).count();
+        assert_eq!(progress.empty_pixels, u64::try_from(empty).unwrap());
+        assert!((1..7_000).contains(&empty), "one tile of several: {empty}");
+        for (beauty, samples) in part.beauty.iter().zip(&part.samples) {
+            assert_eq!(*beauty == [0.0; 3], *samples == 0);
+        }
+        assert_eq!(image_of(layers()).1.empty_pixels, 0);
     }
 
     #[test]

@@ -363,3 +363,96 @@ fn numbers_in_a_file_never_size_memory() {
         );
     }
 }
+
+#[test]
+fn a_byte_order_mark_is_no_part_of_a_file() {
+    let marked = |text: &str| format!("\u{feff}{text}");
+    let plain = scene_of(SCENE, OBJ, MTL).unwrap();
+    let all = scene_of(&marked(SCENE), &marked(OBJ), &marked(MTL)).unwrap();
+    assert_eq!(
+        (&all.scene.triangles, &all.scene.materials),
+        (&plain.scene.triangles, &plain.scene.materials)
+    );
+    let vertex_first = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nmtllib a.mtl\nusemtl white\nf 1 2 3 4\n";
+    let first = scene_of(SCENE, &marked(vertex_first), MTL).unwrap();
+    assert_eq!(first.scene.triangles, plain.scene.triangles, "no vertex is lost");
+    assert!(first.report.warnings.is_empty(), "{:?}", first.report.warnings);
+}
+
+#[test]
+fn unknown_statements_are_counted_with_file_and_first_line() {
+    let report = scene_of(SCENE, &format!("{OBJ}V 1 2 3\nvertex 1 2 3\n"), MTL).unwrap().report;
+    let [warning] = &report.warnings[..] else { panic!("{:?}", report.warnings) };
+    assert!(warning.ends_with("a.obj:9: 2 unknown statements ignored, the first is `V`"), "{warning}");
+}
+
+#[test]
+fn arrays_have_exactly_their_length() {
+    let white = format!("{SCENE}[materials.\"white\"]\ntype = \"diffuse\"\nreflectance = [0, 0, 0, 0]");
+    for (toml, line, key) in [
+        (SCENE.replace("eye = [0, 0, 5]", "eye = [1, 2, 3, 4]"), 6, "eye"),
+        (SCENE.replace("up = [0, 1, 0]", "up = [0, 1, 0, 0]"), 8, "up"),
+        (SCENE.replace("radiance = [1, 1, 1]", "radiance = [1, 1, 1, 1]"), 11, "radiance"),
+        (white, 14, "reflectance"),
+    ] {
+        let error = refused_toml(&toml);
+        assert!(error.starts_with(&format!("scene.toml:{line}: ")) && error.contains(key), "{error}");
+        assert!(error.contains("needs exactly 3 numbers, found 4"), "{error}");
+    }
+}
+
+#[test]
+fn values_that_single_precision_cannot_take_are_refused_with_their_place() {
+    let with = |from: &str, to: &str| SCENE.replace(from, to);
+    let white = |entry: &str| format!("{SCENE}[materials.\"white\"]\n{entry}");
+    for (toml, expected) in [
+        (with("[0, 0, 5]", "[1e30, 1e30, -1e30]"), "scene.toml:6: camera.eye: 1e30 must be finite and"),
+        (with("target = [0, 0, 0]", "target = [0, -2e9, 0]"), "scene.toml:7: camera.target: "),
+        (with("up = [0, 1, 0]", "up = [0, 1e30, 0]"), "scene.toml:8: camera.up: "),
+        (with("hfov_deg = 40", "hfov_deg = 1e-30"), "scene.toml:9: camera.hfov_deg: "),
+        (with("hfov_deg = 40", "hfov_deg = 179.99"), "scene.toml:9: camera.hfov_deg: "),
+        (with("radiance = [1, 1, 1]", "radiance = [1, 1e38, 1]"), "scene.toml:11: environment.radiance: "),
+        (
+            white("type = \"diffuse\"\nemission = [1e38, 0, 0]"),
+            "scene.toml:14: materials.\"white\".emission: ",
+        ),
+        (white("type = \"dielectric\"\nior = 1e30"), "scene.toml:14: materials.\"white\".ior: "),
+    ] {
+        let error = refused_toml(&toml).replace("1000000000000000000000000000000 must", "1e30 must");
+        assert!(error.starts_with(expected), "expected {expected}, got {error}");
+    }
+    let error = scene_of(SCENE, OBJ, &format!("{MTL}Ke 1e38 0 0\n")).unwrap_err().to_string();
+    assert!(error.contains("a.mtl:3: material \"white\": `Ke` must be at most 1e12"), "{error}");
+    for index in ["0", "-1.5", "1e30"] {
+        let report = scene_of(SCENE, OBJ, &format!("{MTL}Ni {index}\nd 0.5\n")).unwrap().report;
+        assert!(report.warnings[0].contains("a.mtl:3: material \"white\": `Ni` "), "{:?}", report.warnings);
+    }
+}
+
+#[test]
+fn lights_are_not_supported_whatever_they_say() {
+    for entry in ["", "type = \"point\"", "type = \"spot\"", "radius = 1", "position = [0]"] {
+        let error = refused_toml(&format!("{SCENE}[[light]]\n{entry}\n"));
+        let expected = "scene.toml:12: a light ([[light]]) is not supported yet; moreover scene.toml:";
+        assert!(error.starts_with(expected), "{entry:?}: {error}");
+    }
+    scene_of(&format!("light = []\n{SCENE}"), OBJ, MTL).expect("no light is no light");
+}
+
+#[test]
+fn what_is_named_twice_is_told() {
+    let again = scene_of(SCENE, OBJ, &format!("{MTL}newmtl white\nKd 1 1 1\n")).unwrap().report.warnings;
+    assert!(again[0].contains("a.mtl:3: material \"white\" is defined again"), "{again:?}");
+    let toml = SCENE.replace("[\"a.obj\"]", "[\"a.obj\",\n\"./a.obj\"]");
+    let twice = scene_of(&toml, OBJ, MTL).unwrap().report.warnings;
+    let expected = "scene.toml:2: geometry file \"./a.obj\" is named again";
+    assert!(twice.len() == 1 && twice[0].contains(expected), "{twice:?}");
+    let libraries = folder(&[
+        ("scene.toml", SCENE.as_bytes()),
+        ("a.obj", OBJ.replace("a.mtl", "a.mtl b.mtl").as_bytes()),
+        ("a.mtl", MTL.as_bytes()),
+        ("b.mtl", MTL.as_bytes()),
+    ]);
+    let both = scene::load(libraries.path()).unwrap().report.warnings;
+    assert!(both.len() == 1 && both[0].contains("b.mtl:1: material \"white\" is defined again"), "{both:?}");
+}

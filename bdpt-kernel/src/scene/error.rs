@@ -112,6 +112,16 @@ pub enum SceneError {
         /// What.
         what: String,
     },
+    /// The scene asks for something that cannot be rendered yet, and there is a mistake too.
+    #[error("{place}: {what} is not supported yet; moreover {mistake}")]
+    UnsupportedAndWrong {
+        /// Where.
+        place: Place,
+        /// What.
+        what: String,
+        /// The mistake.
+        mistake: Box<SceneError>,
+    },
     /// A line of geometry cannot be used.
     #[error("{place}: {}{fault}", object.as_ref().map(|name| format!("object \"{name}\": ")).unwrap_or_default())]
     Geometry {

@@ -100,6 +100,7 @@ pub fn load(path: &Path) -> Result<LoadedScene, SceneError> {
     let mut loader = Loader {
         description: &description,
         named: BTreeSet::new(),
+        read: BTreeMap::new(),
         report: LoadReport { file: file.clone(), ..LoadReport::default() },
         scene: Scene {
             film: description.film,
@@ -133,6 +134,8 @@ struct Loader<'a> {
     description: &'a Description,
     /// Names that some geometry uses.
     named: BTreeSet<String>,
+    /// Geometry files read, and where each is named.
+    read: BTreeMap<PathBuf, Place>,
     report: LoadReport,
     scene: Scene,
 }
@@ -143,6 +146,11 @@ impl Loader<'_> {
         if !path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("obj")) {
             let what = format!("geometry file \"{name}\": only OBJ can be read, anything else");
             return Err(SceneError::Unsupported { place: place.clone(), what });
+        }
+        if let Some(first) = self.read.insert(path.clone(), place.clone()) {
+            let twice =
+                format!("{place}: geometry file \"{name}\" is named again (first at {first}): loaded twice");
+            self.report.warn(twice);
         }
         let source = Source::read(&path, MAX_GEOMETRY_BYTES)?;
         let mut geometry = Geometry::parse(&source)?;
@@ -196,7 +204,14 @@ impl Loader<'_> {
                 }
                 let library = Library::parse(&Source::read(&path, MAX_LIBRARY_BYTES)?)?;
                 library.warnings.into_iter().for_each(|warning| self.report.warn(warning));
-                all.get_or_insert_with(BTreeMap::new).extend(library.materials);
+                let all = all.get_or_insert_with(BTreeMap::new);
+                for (name, material) in library.materials {
+                    let place = material.place.clone();
+                    if all.insert(name.clone(), material).is_some() {
+                        let again = "is defined again: the later one counts";
+                        self.report.warn(format!("{place}: material \"{name}\" {again}"));
+                    }
+                }
             }
         }
         Ok(all)

@@ -3,6 +3,16 @@
 use glam::Vec3;
 use thiserror::Error;
 
+/// Largest coordinate of geometry and camera. Normalisation scales a scene to a radius of 2..4 and the camera with it; at 1e9
+/// a triangle's squared area (1e36) still is an `f32` (up to 3e38).
+pub(crate) const MAX_COORDINATE: f32 = 1e9;
+
+/// Largest emitted radiance in a channel: its square (variance, 1e24) times 2^32 samples stays below the 3e38 of an `f32`.
+pub(crate) const MAX_RADIANCE: f32 = 1e12;
+
+/// Indices of refraction that can be rendered: far beyond any material, and Fresnel's fourth powers (1e8) leave digits.
+pub(crate) const IOR_RANGE: std::ops::RangeInclusive<f32> = 0.01..=100.0;
+
 /// Image size in pixels, both > 0.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct FilmSize {
@@ -71,8 +81,14 @@ pub struct Camera {
     pub target: Vec3,
     /// Roughly up; not parallel to the view axis.
     pub up: Vec3,
-    /// Horizontal field of view in degrees, 0 < hfov < 180.
+    /// Horizontal field of view in degrees, in [`Self::HFOV_RANGE_DEG`].
     pub hfov_deg: f32,
+}
+
+impl Camera {
+    /// Fields of view that can be rendered, in degrees: at both ends the tangent of the half (9e-5, 1146) and the inverse of
+    /// its square, which weighs paths to the camera, keep their digits in single precision.
+    pub const HFOV_RANGE_DEG: std::ops::RangeInclusive<f32> = 0.01..=179.9;
 }
 
 /// How a surface scatters.
@@ -90,7 +106,7 @@ pub enum Bsdf {
     },
     /// Smooth glass; the winding tells the outside (counter-clockwise = outside, index 1).
     Dielectric {
-        /// Index of refraction inside, > 0.
+        /// Index of refraction inside, 0.01 to 100.
         ior: f32,
     },
 }

@@ -2,7 +2,7 @@
 //!
 //! | library says | rendered as |
 //! |---|---|
-//! | `d` < 1 (or `Tr` > 0) or `illum` 4, 6, 7, 9, with an `Ni` > 0 that is not 1 | smooth dielectric of that `Ni` |
+//! | `d` < 1 (or `Tr` > 0) or `illum` 4, 6, 7, 9, with an `Ni` in 0.01..100 that is not 1 | smooth dielectric of that `Ni` |
 //! | `illum` 5; or black `Kd` and a `Ks` with `illum` 3, 8 or `Ns` >= 1000 | mirror of `Ks` |
 //! | any `Ke` | emission, beside the rest |
 //! | else without `Ks`, PBR keys or transparency | diffuse of `Kd` (absent: grey; black if it emits) |
@@ -17,7 +17,7 @@ use glam::Vec3;
 
 use super::{
     error::SceneError,
-    model::Bsdf,
+    model::{Bsdf, IOR_RANGE, MAX_RADIANCE},
     source::{Source, excerpt},
     surface::{GREY, Surface},
     toml::DescribedMaterial,
@@ -84,6 +84,14 @@ impl Library {
             let known = block
                 .read(statement, rest)
                 .map_err(|reason| fault(source, line, Some(&block.name), reason))?;
+            if let Some(index) = block.index.filter(|index| !IOR_RANGE.contains(index)) {
+                let (place, name) = (source.line(line), &block.name);
+                let (least, most) = (IOR_RANGE.start(), IOR_RANGE.end());
+                library.warnings.push(format!(
+                    "{place}: material \"{name}\": `Ni` {index} is not in {least}..{most}: ignored"
+                ));
+                block.index = None;
+            }
             if !known {
                 unknown.get_or_insert_with(|| (line, excerpt(statement), 0)).2 += 1;
             }
@@ -121,7 +129,13 @@ impl Block {
             "Ka" => drop(colour(statement, rest)?),
             "Kd" => self.diffuse = Some(colour(statement, rest)?),
             "Ks" => self.specular = Some(colour(statement, rest)?),
-            "Ke" => self.emission = Some(colour(statement, rest)?),
+            "Ke" => {
+                let emission = colour(statement, rest)?;
+                if emission.max_element() > MAX_RADIANCE {
+                    return Err(format!("`Ke` must be at most {MAX_RADIANCE:e}, found `{}`", excerpt(rest)));
+                }
+                self.emission = Some(emission);
+            }
             "Tf" => self.filter = Some(colour(statement, rest)?),
             "Ns" => self.exponent = Some(number(statement, rest)?),
             "Ni" => self.index = Some(number(statement, rest)?),
@@ -191,7 +205,7 @@ impl Block {
 
     fn transparent(&self, diffuse: Vec3, ignored: &mut Vec<String>) -> Surface {
         match self.index {
-            Some(ior) if ior > 0.0 && (ior - 1.0).abs() > f32::EPSILON => {
+            Some(ior) if (ior - 1.0).abs() > f32::EPSILON => {
                 if self.filter.is_some_and(|filter| filter != Vec3::ONE) {
                     ignored.push("`Tf` (coloured glass) is not supported yet: ignored".to_owned());
                 }

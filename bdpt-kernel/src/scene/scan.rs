@@ -12,11 +12,9 @@ use glam::Vec3;
 
 use super::{
     error::{GeometryFault, SceneError},
+    model::MAX_COORDINATE,
     source::{Source, excerpt},
 };
-
-/// Largest coordinate: beyond it single precision has no room for squares of areas.
-const MAX_COORDINATE: f32 = 1e9;
 
 /// Most vertices, normals or texture coordinates of a file.
 const MAX_VERTICES: usize = 1 << 27;

@@ -10,6 +10,9 @@ use super::error::{Place, SceneError};
 /// Longest piece of a line that an error repeats, in characters.
 const EXCERPT_CHARS: usize = 60;
 
+/// What editors on Windows put before UTF-8 text: no part of it.
+const BYTE_ORDER_MARK: &[u8] = b"\xef\xbb\xbf";
+
 /// A text file in memory.
 #[derive(Debug)]
 pub(crate) struct Source {
@@ -18,7 +21,7 @@ pub(crate) struct Source {
 }
 
 impl Source {
-    /// Reads a file of at most `most_bytes`. Bytes that are no UTF-8 (names in old encodings) become U+FFFD; control
+    /// Reads a file of at most `most_bytes`. A byte order mark is left out. Bytes that are no UTF-8 (names in old encodings) become U+FFFD; control
     /// bytes are refused: such a file is not text.
     pub(crate) fn read(path: &Path, most_bytes: u64) -> Result<Self, SceneError> {
         let failed = |source| SceneError::Read { place: Place { file: path.to_owned(), line: None }, source };
@@ -30,7 +33,10 @@ impl Source {
             let (file, size_bytes) = (path.to_owned(), metadata.len());
             return Err(SceneError::TooLarge { file, size_bytes, most_bytes });
         }
-        let bytes = fs::read(path).map_err(failed)?;
+        let mut bytes = fs::read(path).map_err(failed)?;
+        if bytes.starts_with(BYTE_ORDER_MARK) {
+            bytes.drain(..BYTE_ORDER_MARK.len());
+        }
         if bytes.is_empty() {
             return Err(SceneError::Empty { file: path.to_owned() });
         }

@@ -3,12 +3,12 @@
 use std::collections::BTreeMap;
 
 use glam::Vec3;
-use serde::Deserialize;
+use serde::{Deserialize, de::IgnoredAny};
 use toml::Spanned;
 
 use super::{
     error::{Place, SceneError},
-    model::{Bsdf, Camera, FilmSize},
+    model::{Bsdf, Camera, FilmSize, IOR_RANGE, MAX_COORDINATE, MAX_RADIANCE},
     source::Source,
     surface::{GREY, Surface, normal_incidence},
 };
@@ -35,11 +35,16 @@ pub(crate) struct DescribedMaterial {
 impl Description {
     /// Reads a scene.toml's text.
     pub(crate) fn parse(source: &Source) -> Result<Self, SceneError> {
-        let raw: RawScene = toml::from_str(&source.text).map_err(|error| description_error(source, error))?;
+        let raw: Result<RawScene, _> =
+            toml::from_str(&source.text).map_err(|error| description_error(source, error));
         let check = Check { source };
-        if let Some(light) = raw.light.first() {
-            return Err(check.light(light));
+        // Whatever else is wrong, and with whatever keys: a light cannot be rendered.
+        if let Ok(Lights { light: Some(light) }) = toml::from_str(&source.text)
+            && !raw.as_ref().is_ok_and(|raw| raw.light.is_empty())
+        {
+            return Err(check.lights(&light, raw));
         }
+        let raw = raw?;
         let geometry = raw.geometry.get_ref();
         if geometry.is_empty() {
             return Err(check.wrong(&raw.geometry, "geometry", "names no file"));
@@ -75,6 +80,26 @@ fn description_error(source: &Source, mut error: toml::de::Error) -> SceneError 
     }
 }
 
+/// Exactly three numbers. An array of serde's would let further ones pass unseen.
+#[derive(Deserialize)]
+#[serde(try_from = "Vec<f32>")]
+struct Three([f32; 3]);
+
+impl TryFrom<Vec<f32>> for Three {
+    type Error = String;
+
+    fn try_from(numbers: Vec<f32>) -> Result<Self, String> {
+        let found = numbers.len();
+        numbers.try_into().map(Self).map_err(|_| format!("needs exactly 3 numbers, found {found}"))
+    }
+}
+
+/// Whether there are lights, whatever they and the rest of the file say.
+#[derive(Deserialize)]
+struct Lights {
+    light: Option<Spanned<IgnoredAny>>,
+}
+
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct RawScene {
@@ -98,9 +123,9 @@ struct RawFilm {
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct RawCamera {
-    eye: Spanned<[f32; 3]>,
-    target: Spanned<[f32; 3]>,
-    up: Spanned<[f32; 3]>,
+    eye: Spanned<Three>,
+    target: Spanned<Three>,
+    up: Spanned<Three>,
     hfov_deg: Spanned<f32>,
     lens_radius: Option<Spanned<f32>>,
     focus_distance: Option<Spanned<f32>>,
@@ -109,7 +134,7 @@ struct RawCamera {
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct RawEnvironment {
-    radiance: Option<Spanned<[f32; 3]>>,
+    radiance: Option<Spanned<Three>>,
     map: Option<Spanned<String>>,
     scale: Option<Spanned<f32>>,
     rotate_deg: Option<Spanned<f32>>,
@@ -120,10 +145,10 @@ struct RawEnvironment {
 struct RawLight {
     #[serde(rename = "type")]
     kind: Spanned<String>,
-    position: Option<Spanned<[f32; 3]>>,
-    intensity: Option<Spanned<[f32; 3]>>,
-    direction: Option<Spanned<[f32; 3]>>,
-    irradiance: Option<Spanned<[f32; 3]>>,
+    position: Option<Spanned<Three>>,
+    intensity: Option<Spanned<Three>>,
+    direction: Option<Spanned<Three>>,
+    irradiance: Option<Spanned<Three>>,
 }
 
 #[derive(Deserialize)]
@@ -131,15 +156,15 @@ struct RawLight {
 struct RawMaterial {
     #[serde(rename = "type")]
     kind: Spanned<String>,
-    reflectance: Option<Spanned<[f32; 3]>>,
-    specular: Option<Spanned<[f32; 3]>>,
-    emission: Option<Spanned<[f32; 3]>>,
+    reflectance: Option<Spanned<Three>>,
+    specular: Option<Spanned<Three>>,
+    emission: Option<Spanned<Three>>,
     distribution: Option<Spanned<String>>,
     alpha: Option<Spanned<f32>>,
     alpha_u: Option<Spanned<f32>>,
     alpha_v: Option<Spanned<f32>>,
-    eta: Option<Spanned<[f32; 3]>>,
-    k: Option<Spanned<[f32; 3]>>,
+    eta: Option<Spanned<Three>>,
+    k: Option<Spanned<Three>>,
     ior: Option<Spanned<f32>>,
 }
 
@@ -164,26 +189,33 @@ impl Check<'_> {
     /// Three numbers that each fulfil `good`, else "must be `needs`".
     fn rgb(
         &self,
-        value: &Spanned<[f32; 3]>,
+        value: &Spanned<Three>,
         key: &str,
         needs: &str,
         good: impl Fn(f32) -> bool,
     ) -> Result<Vec3, SceneError> {
-        match value.get_ref().iter().find(|number| !good(**number)) {
+        match value.get_ref().0.iter().find(|number| !good(**number)) {
             Some(number) => Err(self.wrong(value, key, format!("{number} must be {needs}"))),
-            None => Ok(Vec3::from(*value.get_ref())),
+            None => Ok(Vec3::from(value.get_ref().0)),
         }
     }
 
-    fn finite3(&self, value: &Spanned<[f32; 3]>, key: &str) -> Result<Vec3, SceneError> {
+    fn finite3(&self, value: &Spanned<Three>, key: &str) -> Result<Vec3, SceneError> {
         self.rgb(value, key, "finite", f32::is_finite)
     }
 
-    fn radiance(&self, value: &Spanned<[f32; 3]>, key: &str) -> Result<Vec3, SceneError> {
-        self.rgb(value, key, "finite and not negative", |number| number.is_finite() && number >= 0.0)
+    fn radiance(&self, value: &Spanned<Three>, key: &str) -> Result<Vec3, SceneError> {
+        let needs = format!("finite, not negative and at most {MAX_RADIANCE:e}");
+        self.rgb(value, key, &needs, |number| (0.0..=MAX_RADIANCE).contains(&number))
     }
 
-    fn reflectance(&self, value: &Spanned<[f32; 3]>, key: &str) -> Result<Vec3, SceneError> {
+    /// A point or direction of the camera.
+    fn coordinates(&self, value: &Spanned<Three>, key: &str) -> Result<Vec3, SceneError> {
+        let needs = format!("finite and at most {MAX_COORDINATE:e} from 0");
+        self.rgb(value, key, &needs, |number| number.abs() <= MAX_COORDINATE)
+    }
+
+    fn reflectance(&self, value: &Spanned<Three>, key: &str) -> Result<Vec3, SceneError> {
         self.rgb(value, key, "in 0..1", |number| (0.0..=1.0).contains(&number))
     }
 
@@ -206,6 +238,11 @@ impl Check<'_> {
         self.number(value, key, "positive and finite", |number| number.is_finite() && number > 0.0)
     }
 
+    fn ior(&self, value: &Spanned<f32>, key: &str) -> Result<f32, SceneError> {
+        let needs = format!("positive, in {}..{}", IOR_RANGE.start(), IOR_RANGE.end());
+        self.number(value, key, &needs, |number| IOR_RANGE.contains(&number))
+    }
+
     fn film(&self, raw: &RawFilm) -> Result<FilmSize, SceneError> {
         let edge = |value: &Spanned<i64>, key: &str| {
             let px = u32::try_from(*value.get_ref()).unwrap_or(0);
@@ -220,13 +257,13 @@ impl Check<'_> {
     }
 
     fn camera(&self, raw: &RawCamera) -> Result<Camera, SceneError> {
-        let eye = self.finite3(&raw.eye, "camera.eye")?;
-        let target = self.finite3(&raw.target, "camera.target")?;
-        let up = self.finite3(&raw.up, "camera.up")?;
+        let eye = self.coordinates(&raw.eye, "camera.eye")?;
+        let target = self.coordinates(&raw.target, "camera.target")?;
+        let up = self.coordinates(&raw.up, "camera.up")?;
+        let range = Camera::HFOV_RANGE_DEG;
+        let needs = format!("between {} and {} degrees", range.start(), range.end());
         let hfov_deg =
-            self.number(&raw.hfov_deg, "camera.hfov_deg", "between 0 and 180 degrees", |degrees| {
-                degrees > 0.0 && degrees < 180.0
-            })?;
+            self.number(&raw.hfov_deg, "camera.hfov_deg", &needs, |degrees| range.contains(&degrees))?;
         let axis = (target - eye).as_dvec3();
         if axis.length_squared() == 0.0 {
             return Err(self.wrong(
@@ -277,7 +314,19 @@ impl Check<'_> {
         Ok((radiance != Vec3::ZERO).then_some(radiance))
     }
 
-    /// Lights are read in full, so that a mistake is told before the regret.
+    /// Lights cannot be rendered: that comes first, then what is wrong besides.
+    fn lights(&self, at: &Spanned<IgnoredAny>, raw: Result<RawScene, SceneError>) -> SceneError {
+        let (place, mistake) = match raw {
+            Err(mistake) => (self.place(at), mistake),
+            Ok(raw) => match self.light(&raw.light[0]) {
+                regret @ SceneError::Unsupported { .. } => return regret,
+                mistake => (self.place(&raw.light[0]), mistake),
+            },
+        };
+        let mistake = Box::new(mistake);
+        SceneError::UnsupportedAndWrong { place, what: "a light ([[light]])".to_owned(), mistake }
+    }
+
     fn light(&self, raw: &Spanned<RawLight>) -> SceneError {
         let light = raw.get_ref();
         let (needed, other) = match light.kind.get_ref().as_str() {
@@ -337,7 +386,7 @@ impl Check<'_> {
         let reflectance = reflectance.transpose()?;
         let specular =
             raw.specular.as_ref().map(|value| self.reflectance(value, &key("specular"))).transpose()?;
-        let ior = raw.ior.as_ref().map(|value| self.positive(value, &key("ior"))).transpose()?;
+        let ior = raw.ior.as_ref().map(|value| self.ior(value, &key("ior"))).transpose()?;
         let fresnel = self.fresnel(raw, &key)?;
         self.roughness(raw, kind, &key)?;
 
