@@ -120,7 +120,7 @@ pub enum SceneError {
         /// What.
         what: String,
         /// The mistake.
-        mistake: Box<SceneError>,
+        mistake: Box<Self>,
     },
     /// A line of geometry cannot be used.
     #[error("{place}: {}{fault}", object.as_ref().map(|name| format!("object \"{name}\": ")).unwrap_or_default())]
