@@ -78,7 +78,9 @@ async fn run_on(
     arguments: &RenderArgs,
     stops: &mut Stops,
 ) -> Result<RunSummary, FarmError> {
-    let farm = Farm::connect(FarmOptions::new(address, app_name(&arguments.scene))).await?;
+    let options =
+        FarmOptions { global_stealing: true, ..FarmOptions::new(address, app_name(&arguments.scene)) };
+    let farm = Farm::connect(options).await?;
     let plan = render.plan();
     #[expect(clippy::cast_precision_loss, reason = "a rate for people")]
     let units = Units {
