@@ -223,6 +223,7 @@ impl Driver {
             CoordinatorToNode::AppJoined { .. }
             | CoordinatorToNode::AppLeft { .. }
             | CoordinatorToNode::Cancel { .. }
+            | CoordinatorToNode::Retract { .. }
             | CoordinatorToNode::Drain
             | CoordinatorToNode::HeartbeatAck { .. } => {}
         }

@@ -103,8 +103,8 @@ fn stormy(seed: u64) -> World {
         apps: 2,
         max_crashes: 1_000,
         max_jobs: 100,
-        global_stealing: seed % 3 != 0,
-        score_error: if seed % 2 == 0 { 1.0 } else { 3.0 },
+        global_stealing: !seed.is_multiple_of(3),
+        score_error: if seed.is_multiple_of(2) { 1.0 } else { 3.0 },
     };
     let mut world = World::new(&setup);
     for app in 0..2 {

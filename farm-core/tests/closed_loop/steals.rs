@@ -48,7 +48,7 @@ fn makespan_ratio(seed: u64, jobs: u32, global_stealing: bool) -> f64 {
     assert!(world.work.runs.values().all(|runs| *runs == 1), "I5: a steal executes nothing twice");
     assert_eq!(world.coordinator.stolen_jobs() > 0, global_stealing, "only where it is allowed");
     let work_ns: u64 = (0..jobs).map(|index| cost_ns(JobIndex(index))).sum();
-    let speed: f64 = (0..NODES).map(|node| speed(node)).sum();
+    let speed: f64 = (0..NODES).map(speed).sum();
     took * speed / (work_ns as f64 / 1e9)
 }
 
