@@ -65,7 +65,7 @@ const RESTRICTED: [(&str, &[&str]); 12] = [
 /// What tests of a crate may name besides: devices to run kernels on, naga to check layouts, a farm to link against.
 const ALSO_IN_TESTS: [(&str, &[&str]); 4] = [
     ("bdpt-kernel", &["gpu-exec", "naga"]),
-    ("mi-kernel", &["gpu-exec"]),
+    ("mi-kernel", &["gpu-exec", "naga"]),
     ("client-sdk", &["coordinator", "worker", "gpu-exec"]),
     ("worker", &["coordinator", "client-sdk"]),
 ];

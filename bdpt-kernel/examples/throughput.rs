@@ -137,8 +137,11 @@ fn main() -> Result<(), Box<dyn Error>> {
     let packed = PackedScene::new(&normalised, &bvh)?;
     let film = FilmSize { width_px: arguments.width_px, height_px: arguments.height_px };
     let frame = FrameParams::new(&packed, film, arguments.options)?;
-    let module = arguments.module.as_ref().map(std::fs::read_to_string).transpose()?;
-    let (scene, contents) = register(&packed, module.as_deref().unwrap_or_else(module_source));
+    let module = match &arguments.module {
+        Some(file) => std::fs::read_to_string(file)?,
+        None => module_source().to_owned(),
+    };
+    let (scene, contents) = register(&packed, &module);
     let config = ExecutorConfig { unchecked: arguments.unchecked, ..ExecutorConfig::default() };
     let (events, inbox) = mpsc::channel();
     let device = expand(&[DeviceSpec::All])?;

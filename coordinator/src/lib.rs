@@ -43,7 +43,7 @@ pub struct CoordinatorOptions {
     pub listen: SocketAddr,
     /// HTTP address (status page, metrics, health); port 0 lets the system choose.
     pub http: SocketAddr,
-    /// Where the epoch is kept; `None`: in memory only, the epoch is 1.
+    /// Where the epoch is kept; `None`: nowhere, the epoch is the time of the start.
     pub state: Option<PathBuf>,
     /// Timings told to nodes and applications.
     pub liveness: Liveness,
@@ -110,6 +110,8 @@ pub struct CoordinatorHandle {
     stop_servers: watch::Sender<()>,
     /// Owner, gRPC server, HTTP server.
     tasks: [JoinHandle<()>; 3],
+    /// Keeps the state directory locked.
+    _store: Box<dyn ControlStore>,
 }
 
 impl CoordinatorHandle {
@@ -162,7 +164,7 @@ pub async fn start(options: CoordinatorOptions) -> Result<CoordinatorHandle, Sta
     let (grpc, grpc_addr) = listen("gRPC", options.listen).await?;
     let (http, http_addr) = listen("HTTP", options.http).await?;
     // After the addresses: a second coordinator on them is refused without counting as a life.
-    let mut store: Box<dyn ControlStore + Send> = match &options.state {
+    let mut store: Box<dyn ControlStore> = match &options.state {
         Some(directory) => Box::new(FileStore::open(directory)?),
         None => Box::new(MemoryStore),
     };
@@ -181,7 +183,7 @@ pub async fn start(options: CoordinatorOptions) -> Result<CoordinatorHandle, Sta
     let http_task = tokio::spawn(serve_http(http, owner.clone(), servers_stop));
     tracing::info!(%epoch, grpc = %grpc_addr, http = %http_addr, "coordinator started");
     let tasks = [owner_task, grpc_task, http_task];
-    Ok(CoordinatorHandle { owner, grpc_addr, http_addr, stop_owner, stop_servers, tasks })
+    Ok(CoordinatorHandle { owner, grpc_addr, http_addr, stop_owner, stop_servers, tasks, _store: store })
 }
 
 async fn listen(what: &'static str, address: SocketAddr) -> Result<(TcpListener, SocketAddr), StartError> {

@@ -31,7 +31,7 @@ pub(crate) struct Arguments {
     /// Address of status page, metrics and health; port 0 lets the system choose [default: 127.0.0.1:7701].
     #[arg(long, value_name = "HOST:PORT", env = "GLEANER_HTTP")]
     http: Option<String>,
-    /// Directory for what must outlive this process; without it every start is epoch 1.
+    /// Directory for what must outlive this process; without it a restart is known by its time alone.
     #[arg(long, value_name = "DIR", env = "GLEANER_STATE")]
     state: Option<PathBuf>,
     /// How soon silence counts [default: default].

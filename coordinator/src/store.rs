@@ -2,9 +2,11 @@
 //! re-registration and never stored.
 
 use std::{
-    fs::{self, File},
+    fmt::Debug,
+    fs::{self, File, TryLockError},
     io::{self, Write as _},
     path::{Path, PathBuf},
+    time::SystemTime,
 };
 
 use farm_core::id::Epoch;
@@ -15,36 +17,51 @@ use crate::StartError;
 const EPOCH_FILE: &str = "epoch";
 /// Where the next one is written before it takes the file's place.
 const EPOCH_DRAFT: &str = "epoch.new";
+/// Held by the coordinator that uses the directory.
+const LOCK_FILE: &str = "lock";
+/// From 1970-01-01 to 2026-01-01: 56 years, 14 of them leap years.
+const SECONDS_1970_TO_2026: u64 = (56 * 365 + 14) * 86_400;
 /// Longest epoch file that is believed, in bytes: a u32 has ten digits.
 const MAX_EPOCH_BYTES: u64 = 16;
 
 /// Durable state of a coordinator.
-pub(crate) trait ControlStore {
+pub(crate) trait ControlStore: Debug + Send {
     /// Begins a new life: larger than every earlier one, and durable when this returns.
     fn begin_epoch(&mut self) -> Result<Epoch, StartError>;
 }
 
-/// No state: each life is the first. Workers and applications that outlive it refuse nothing, but cannot tell lives apart.
+/// No state: lives are told apart by the wall clock, so that ids of an earlier life on the same address are never given out
+/// again. Two starts within one second, or a clock set back between them, are what `FileStore` is for.
 #[derive(Debug)]
 pub(crate) struct MemoryStore;
 
 impl ControlStore for MemoryStore {
     fn begin_epoch(&mut self) -> Result<Epoch, StartError> {
-        Ok(Epoch(1))
+        let since_1970 = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
+        let seconds = since_1970.as_secs().saturating_sub(SECONDS_1970_TO_2026).max(1);
+        // Full in the year 2162.
+        Ok(Epoch(u32::try_from(seconds).unwrap_or(u32::MAX)))
     }
 }
 
-/// State in a directory of its own.
+/// State in a directory of its own, locked for as long as this lives.
 #[derive(Debug)]
 pub(crate) struct FileStore {
     directory: PathBuf,
+    _lock: File,
 }
 
 impl FileStore {
-    /// Makes the directory if it is not there.
+    /// Makes the directory if it is not there; refuses one that another coordinator uses.
     pub(crate) fn open(directory: &Path) -> Result<Self, StartError> {
         fs::create_dir_all(directory).map_err(|error| fault(directory, &error))?;
-        Ok(Self { directory: directory.to_owned() })
+        let path = directory.join(LOCK_FILE);
+        let lock = File::create(&path).map_err(|error| fault(&path, &error))?;
+        match lock.try_lock() {
+            Ok(()) => Ok(Self { directory: directory.to_owned(), _lock: lock }),
+            Err(TryLockError::WouldBlock) => Err(fault(directory, &"another coordinator uses it")),
+            Err(TryLockError::Error(error)) => Err(fault(&path, &error)),
+        }
     }
 
     fn last_epoch(&self) -> Result<u32, StartError> {
@@ -99,7 +116,23 @@ mod tests {
             assert_eq!(FileStore::open(&path).unwrap().begin_epoch().unwrap(), Epoch(expected));
         }
         assert!(!path.join(EPOCH_DRAFT).exists(), "the draft took the file's place");
-        assert_eq!(MemoryStore.begin_epoch().unwrap(), Epoch(1));
+    }
+
+    #[test]
+    fn a_directory_has_one_coordinator() {
+        let directory = tempfile::tempdir().unwrap();
+        let first = FileStore::open(directory.path()).unwrap();
+        let error = FileStore::open(directory.path()).unwrap_err();
+        assert!(error.to_string().contains("another coordinator"), "got {error}");
+        drop(first);
+        FileStore::open(directory.path()).unwrap();
+    }
+
+    #[test]
+    fn without_state_lives_are_told_apart_by_the_clock() {
+        // The hostile test of 2026-11-23: with epoch 1 at each start, a stranger got the id of an application of the life
+        // before, and the two took over each other's session for ever.
+        assert!(MemoryStore.begin_epoch().unwrap() > Epoch(20_000_000), "the clock is past August 2026");
     }
 
     #[test]

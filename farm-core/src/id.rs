@@ -19,21 +19,39 @@ macro_rules! id {
     };
 }
 
+/// An id that a coordinator issues: its epoch in the upper half, a running number in the lower, both shown.
+macro_rules! issued_id {
+    ($(#[$doc:meta])* $name:ident, $prefix:literal) => {
+        $(#[$doc])*
+        #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+        pub struct $name(pub u64);
+
+        impl fmt::Display for $name {
+            fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+                match self.0 >> 32 {
+                    0 => write!(f, concat!($prefix, "{}"), self.0),
+                    epoch => write!(f, concat!($prefix, "{}.{}"), epoch, self.0 & 0xffff_ffff),
+                }
+            }
+        }
+    };
+}
+
 id!(
     /// One life of the coordinator: +1 at each start. Messages of a smaller epoch are refused.
     Epoch(u32), "epoch-"
 );
-id!(
+issued_id!(
     /// A worker node, named by the coordinator at registration.
-    NodeId(u64), "node-"
+    NodeId, "node-"
 );
 id!(
     /// One life of a worker process; drawn by the worker's driver at its start.
     NodeSession(u64), "session-"
 );
-id!(
+issued_id!(
     /// A registered application, cluster-wide unique, never reused (thesis 5.4.1).
-    AppId(u64), "app-"
+    AppId, "app-"
 );
 id!(
     /// One life of an application that keeps its [`AppId`] over restarts.

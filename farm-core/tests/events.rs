@@ -398,7 +398,7 @@ fn after(now: &mut Instant, step: Step) -> Instant {
 }
 
 proptest! {
-    #![proptest_config(ProptestConfig { cases: 512, failure_persistence: None, ..ProptestConfig::default() })]
+    #![proptest_config(ProptestConfig { cases: 2_000, failure_persistence: None, ..ProptestConfig::default() })]
 
     #[test]
     fn the_coordinator_keeps_its_invariants(steps in steps(18)) {
@@ -432,7 +432,11 @@ proptest! {
             machine.handle_timeout(now);
             machine.check_invariants();
             prop_assert!(machine.poll_timeout().is_none_or(|due| due > now), "a timer that is due was not acted on");
-            machine.handle(now, worker_event(step));
+            let event = worker_event(step);
+            if let worker::Event::Executed { job, device, .. } = &event {
+                handed.retain(|handed| *handed != (*job, *device));
+            }
+            machine.handle(now, event);
             machine.check_invariants();
             drain_worker(&mut machine, &mut handed);
             run_executors(&mut machine, now, step, &mut handed);

@@ -8,7 +8,7 @@ use clap::{Args, Parser, Subcommand, ValueEnum};
 #[derive(Debug, Parser)]
 #[command(name = "farmctl", version, disable_version_flag = false)]
 pub(crate) struct Cli {
-    /// The farm's coordinator; without one, `render` and `bench` start a farm of their own.
+    /// The farm's coordinator; without one, `render`, `mi` and `bench` start a farm of their own.
     #[arg(long, env = "GLEANER_COORDINATOR", value_name = "HOST:PORT")]
     pub coordinator: Option<String>,
     /// How reads are printed.
@@ -37,6 +37,8 @@ pub(crate) enum Verb {
     Up(UpArgs),
     /// Render a scene to an image.
     Render(RenderArgs),
+    /// Mutual information of an alignment's columns, with the shuffling null model.
+    Mi(MiArgs),
     /// Write one of the shipped scenes into a folder.
     Scene(SceneArgs),
     /// Show the farm: nodes, devices, queues, applications.
@@ -88,6 +90,45 @@ pub(crate) struct RenderArgs {
     /// Devices of the own farm when no coordinator is given; repeatable.
     #[arg(long = "device", value_name = "SPEC")]
     pub devices: Vec<String>,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct MiArgs {
+    /// The alignment: FASTA, A3M, A2M, Stockholm, Clustal or one sequence a line.
+    pub alignment: PathBuf,
+    /// Where the results go; made if missing.
+    #[arg(short = 'o', long = "output", value_name = "FOLDER")]
+    pub folder: PathBuf,
+    /// Iterations of the null model: every column shuffled by itself.
+    #[arg(long, default_value_t = 1_000, value_parser = clap::value_parser!(u64).range(1..=10_000_000))]
+    pub iterations: u64,
+    /// Same seed, same results, byte for byte, on any farm.
+    #[arg(long, default_value_t = 1)]
+    pub seed: u64,
+    /// Go on from the sums in the folder, up to ITERATIONS in all: the same bytes as in one run.
+    #[arg(long)]
+    pub extend: bool,
+    /// What the farm sends back.
+    #[arg(long, value_enum, default_value_t = MiMode::Reduce)]
+    pub mode: MiMode,
+    /// How many pairs the table holds; five a column without it.
+    #[arg(long, value_name = "PAIRS")]
+    pub top: Option<usize>,
+    /// How progress is told.
+    #[arg(long, value_enum, default_value_t = ProgressStyle::Auto)]
+    pub progress: ProgressStyle,
+    /// Devices of the own farm when no coordinator is given; repeatable.
+    #[arg(long = "device", value_name = "SPEC")]
+    pub devices: Vec<String>,
+}
+
+/// What jobs of `mi` send back; the results are the same.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub(crate) enum MiMode {
+    /// Sums over many iterations.
+    Reduce,
+    /// Every iteration's matrix.
+    Matrix,
 }
 
 /// How progress is told.

@@ -9,6 +9,7 @@ mod embedded;
 mod failure;
 mod output;
 mod progress;
+mod running;
 
 use std::process::ExitCode;
 
@@ -43,6 +44,7 @@ fn run(cli: &Cli) -> Result<(), Failure> {
         match &cli.verb {
             Verb::Up(arguments) => command::up::run(arguments).await,
             Verb::Render(arguments) => Box::pin(command::render::run(arguments, coordinator)).await,
+            Verb::Mi(arguments) => Box::pin(command::mi::run(arguments, coordinator)).await,
             Verb::Scene(arguments) => command::scene::run(arguments),
             Verb::Status(arguments) => command::status::run(arguments, coordinator, cli.output).await,
             Verb::Node(verb) => command::node::run(verb, coordinator).await,

@@ -2,9 +2,10 @@
 //! Waechter 2012).
 //!
 //! Owns the alignment formats ([`parse`]), the integer definition of mutual information on the host ([`Reference`]) and
-//! the null model with its order-independent sums ([`NullModel`], [`Accumulators`]). Everything that a result depends on is an
+//! the null model with its order-independent sums ([`NullModel`], [`Accumulators`]), and the kernels that compute the same
+//! ([`gpu`]). Everything that a result depends on is an
 //! integer, so the same alignment, seed and iterations give the same bytes on any machine and in any split over jobs. It never
-//! opens a file, never asks a clock and never names a GPU: whoever runs it hands in bytes and a seed.
+//! opens a file, never asks a clock and never names a GPU library: whoever runs it hands in bytes and a seed.
 //!
 //! ```
 //! use mi_kernel::{NullModel, Reference, Seed, ShuffleKind, parse};
@@ -22,9 +23,14 @@
 mod alignment;
 mod fixed_point;
 mod formats;
+pub mod gpu;
+#[cfg(feature = "farm")]
+pub mod job;
 mod null_model;
+pub mod output;
 mod philox;
 mod reference;
+pub mod saved;
 mod shuffle;
 
 pub use self::{

@@ -119,6 +119,26 @@ impl Accumulators {
         }
     }
 
+    /// Sums as a job returns them or a file keeps them; `maxima` says which iterations they are of.
+    ///
+    /// # Errors
+    /// A part has another number of pairs than `l` columns make.
+    pub fn from_parts(
+        l: usize,
+        sum: Vec<i64>,
+        sum_of_squares: Vec<u64>,
+        at_least_observed: Vec<u32>,
+        maxima: BTreeMap<u64, i32>,
+    ) -> Result<Self, NullModelError> {
+        let pairs = pair_count(l);
+        for length in [sum.len(), sum_of_squares.len(), at_least_observed.len()] {
+            if length != pairs {
+                return Err(NullModelError::Pairs { ours: pairs, theirs: length });
+            }
+        }
+        Ok(Self { l, sum, sum_of_squares, at_least_observed, maxima })
+    }
+
     /// Adds one iteration's scores.
     ///
     /// # Errors

@@ -27,6 +27,14 @@ pub enum ReferenceError {
         /// Most pairs.
         limit: usize,
     },
+    /// Scores of another alignment.
+    #[error("{scores} scores for {pairs} pairs of columns")]
+    Scores {
+        /// Pairs of the alignment.
+        pairs: usize,
+        /// Scores given.
+        scores: usize,
+    },
 }
 
 /// A pair of columns, `i < j`.
@@ -75,6 +83,32 @@ impl<'a> Reference<'a> {
     /// # Errors
     /// The alignment is too large.
     pub fn new(alignment: &'a Alignment) -> Result<Self, ReferenceError> {
+        let mut reference = Self::unscored(alignment)?;
+        let columns: Vec<&[u8]> = (0..alignment.l()).map(|column| alignment.column(column)).collect();
+        let mut observed = vec![0; pair_count(alignment.l())];
+        reference.score_pairs(&columns, &mut observed);
+        reference.observed = observed;
+        Ok(reference)
+    }
+
+    /// Takes the scores of all pairs from elsewhere: a device computes them faster.
+    ///
+    /// # Errors
+    /// The alignment is too large, or there is not one score for each pair.
+    pub fn with_observed(alignment: &'a Alignment, observed: Vec<i32>) -> Result<Self, ReferenceError> {
+        let reference = Self::unscored(alignment)?;
+        let pairs = pair_count(alignment.l());
+        if observed.len() != pairs {
+            return Err(ReferenceError::Scores { pairs, scores: observed.len() });
+        }
+        Ok(Self { observed, ..reference })
+    }
+
+    /// Counts columns only: what a device needs to score the pairs. [`Self::observed`] is empty.
+    ///
+    /// # Errors
+    /// The alignment is too large.
+    pub fn unscored(alignment: &'a Alignment) -> Result<Self, ReferenceError> {
         let (n, q, l) = (alignment.n(), alignment.q(), alignment.l());
         if pair_count(l) > MAX_PAIRS {
             return Err(ReferenceError::Pairs { l, limit: MAX_PAIRS });
@@ -89,12 +123,12 @@ impl<'a> Reference<'a> {
             .iter()
             .map(|counts| counts.iter().filter(|count| **count > 0).count() == 1)
             .collect();
-        let mut reference = Self { alignment, fixed_point, column_terms, constant, observed: Vec::new() };
-        let columns: Vec<&[u8]> = (0..l).map(|column| alignment.column(column)).collect();
-        let mut observed = vec![0; pair_count(l)];
-        reference.score_pairs(&columns, &mut observed);
-        reference.observed = observed;
-        Ok(reference)
+        Ok(Self { alignment, fixed_point, column_terms, constant, observed: Vec::new() })
+    }
+
+    /// `sum_a T(c_a)` of each column.
+    pub(crate) fn column_terms(&self) -> &[u32] {
+        &self.column_terms
     }
 
     /// The alignment.

@@ -217,6 +217,12 @@ pub enum GeometryFault {
     /// A line ends in a backslash.
     #[error("a line continued with `\\` cannot be read")]
     Continuation,
+    /// The parser refuses what the check before it has passed.
+    #[error("cannot be parsed: {reason}")]
+    Parser {
+        /// What the parser says; it names no line.
+        reason: String,
+    },
     /// A statement that would change the geometry.
     #[error("`{statement}` (free-form geometry) cannot be read")]
     FreeForm {

@@ -8,6 +8,7 @@ mod error;
 pub mod model;
 mod mtl;
 mod obj;
+mod scan;
 mod source;
 mod surface;
 mod toml;
@@ -24,7 +25,8 @@ pub use self::error::{GeometryFault, Place, SceneError};
 use self::{
     model::{Bsdf, Material, Scene},
     mtl::Library,
-    obj::{Geometry, MAX_TRIANGLES, UsedMaterial},
+    obj::Geometry,
+    scan::{MAX_TRIANGLES, UsedMaterial},
     source::{Source, path_inside},
     surface::{GREY, Surface},
     toml::{DescribedMaterial, Description},

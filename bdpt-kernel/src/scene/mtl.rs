@@ -8,8 +8,8 @@
 //! | else without `Ks`, PBR keys or transparency | diffuse of `Kd` (absent: grey; black if it emits) |
 //! | gloss (`Ks` beside `Kd`, low `Ns`), PBR (`Pr Pm Ps Pc aniso`), transparency without `Ni`, unknown `illum` | diffuse of `Kd` (black: `Ks`), named in a warning |
 //!
-//! Textures (`map_*`, `bump`, `disp`, `decal`, `refl`, `norm`) and `Tf` are ignored with a warning. Reading is ours, not tobj's:
-//! that panics on `Kd 0.5`, and knows no lines.
+//! Textures (`map_*`, `bump`, `disp`, `decal`, `refl`, `norm`) and `Tf` are ignored with a warning. Reading is ours: `tobj`'s
+//! panics on `Kd 0.5`, and the check before it, which needs every number and its line, would leave it nothing to do.
 
 use std::collections::BTreeMap;
 

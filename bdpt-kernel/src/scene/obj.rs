@@ -1,27 +1,19 @@
-//! Wavefront OBJ geometry: one pass over the text that checks every line, then triangles.
+//! Wavefront OBJ geometry: text that the scan has passed, read by `tobj`, then made triangles.
 //!
-//! Reads `v vn vt f o g usemtl mtllib`; polygons become fans. Reading is ours, not tobj's: that loses the lines of errors and
-//! the names of unknown materials, reads `usemtl<TAB>x` as nameless, and takes NaN for a number. Memory grows with
-//! the file's length only, never with a number written in it.
+//! Every line goes through [`super::scan`] first, which gives errors their places. `tobj` reads the plain text that the scan
+//! writes, never the user's, and opens no file. Polygons become fans here: `tobj`'s would hide which of them bend inwards.
 
-use std::collections::HashMap;
+use std::io::Read;
 
 use glam::{DVec3, Vec3};
+use tobj::{LoadError, LoadOptions, Mesh};
 
 use super::{
-    error::{GeometryFault, SceneError},
+    error::{GeometryFault, Place, SceneError},
     model::Triangle,
-    source::{Source, excerpt},
+    scan::{Checked, UsedMaterial},
+    source::Source,
 };
-
-/// Largest coordinate: beyond it single precision has no room for squares of areas.
-const MAX_COORDINATE: f32 = 1e9;
-
-/// Most vertices, normals or texture coordinates of a file.
-const MAX_VERTICES: usize = 1 << 27;
-
-/// Most triangles of a file.
-pub(crate) const MAX_TRIANGLES: usize = 1 << 26;
 
 /// A triangle of less than this, in squares of the scene's extent, has no area: its edges would be a billionth of the
 /// scene, and single precision resolves a ten-millionth.
@@ -47,344 +39,139 @@ pub(crate) struct Geometry {
     pub(crate) warnings: Vec<String>,
 }
 
-/// A material as faces name it.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub(crate) struct UsedMaterial {
-    /// `None`: faces before any `usemtl`.
-    pub(crate) name: Option<String>,
-    /// Line of the first `usemtl`, or of the first face.
-    pub(crate) line: usize,
-    /// Object or group there.
-    pub(crate) object: Option<String>,
+/// A corner of a face; its normal as [`unit`] leaves it.
+#[derive(Clone, Copy, Debug)]
+struct Corner {
+    position: Vec3,
+    normal: Vec3,
 }
 
 impl Geometry {
     /// Reads a file's text.
     pub(crate) fn parse(source: &Source) -> Result<Self, SceneError> {
-        let mut scan = Scan::new(source);
-        for text in source.text.split('\n') {
-            scan.line += 1;
-            scan.read(text.trim())?;
-        }
-        scan.check_indices()?;
-        scan.into_geometry()
-    }
-}
+        let refused = |fault| {
+            let place = Place { file: source.path.clone(), line: None };
+            SceneError::Geometry { place, object: None, fault }
+        };
+        let checked = Checked::scan(source)?;
+        let meshes =
+            read(&checked).map_err(|error| refused(GeometryFault::Parser { reason: error.to_string() }))?;
 
-const NO_NORMAL: u32 = u32::MAX;
-
-/// A corner of a face: indices into the file's arrays, from 0.
-#[derive(Clone, Copy, Debug, Default)]
-struct Corner {
-    vertex: u32,
-    normal: u32,
-}
-
-/// The largest index that a corner names, and where: faces may name vertices that follow.
-#[derive(Clone, Debug, Default)]
-struct Largest<'a> {
-    index: i64,
-    line: usize,
-    object: Option<&'a str>,
-}
-
-struct Scan<'a> {
-    source: &'a Source,
-    line: usize,
-    object: Option<&'a str>,
-    positions: Vec<Vec3>,
-    normals: Vec<Vec3>,
-    texture_coordinates: usize,
-    faces: usize,
-    triangles: Vec<([Corner; 3], u32)>,
-    /// First corners of polygons in `triangles` and their number of triangles.
-    polygons: Vec<(usize, usize)>,
-    corners: Vec<Corner>,
-    largest: [Largest<'a>; 3],
-    current: Option<(&'a str, usize)>,
-    /// Index in `materials` of `current`, once a face has used it.
-    current_index: Option<u32>,
-    materials: Vec<UsedMaterial>,
-    material_indices: HashMap<Option<&'a str>, u32>,
-    libraries: Vec<(String, usize)>,
-    unknown: Option<(usize, String, usize)>,
-}
-
-impl<'a> Scan<'a> {
-    fn new(source: &'a Source) -> Self {
-        Self {
-            source,
-            line: 0,
-            object: None,
-            positions: Vec::new(),
-            normals: Vec::new(),
-            texture_coordinates: 0,
-            faces: 0,
-            triangles: Vec::new(),
-            polygons: Vec::new(),
-            corners: Vec::new(),
-            largest: Default::default(),
-            current: None,
-            current_index: None,
-            materials: Vec::new(),
-            material_indices: HashMap::new(),
-            libraries: Vec::new(),
-            unknown: None,
-        }
-    }
-
-    fn fault(&self, fault: GeometryFault) -> SceneError {
-        let object = self.object.map(ToOwned::to_owned);
-        SceneError::Geometry { place: self.source.line(self.line), object, fault }
-    }
-
-    fn read(&mut self, text: &'a str) -> Result<(), SceneError> {
-        if text.ends_with('\\') && !text.starts_with('#') {
-            return Err(self.fault(GeometryFault::Continuation));
-        }
-        let (statement, rest) = text.split_once([' ', '\t']).unwrap_or((text, ""));
-        match statement {
-            "v" => self.vertex(rest),
-            "vn" => self.normal(rest),
-            "vt" => self.texture_coordinate(rest),
-            "f" | "fo" => self.face(rest),
-            "o" | "g" => {
-                self.object = Some(rest.trim()).filter(|name| !name.is_empty());
-                Ok(())
-            }
-            "usemtl" => self.use_material(rest.trim()),
-            "mtllib" => match rest.trim() {
-                "" => Err(self.fault(GeometryFault::NoName { statement: "mtllib" })),
-                name => {
-                    self.libraries.push((name.to_owned(), self.line));
-                    Ok(())
-                }
-            },
-            "surf" | "curv" | "curv2" | "call" => {
-                Err(self.fault(GeometryFault::FreeForm { statement: statement.to_owned() }))
-            }
-            // Smoothing groups, lines, points, parameters and display hints make no surface.
-            "" | "s" | "l" | "p" | "mg" | "vp" | "lod" | "bevel" | "c_interp" | "d_interp" | "shadow_obj"
-            | "trace_obj" | "usemap" | "maplib" => Ok(()),
-            _ if statement.starts_with('#') => Ok(()),
-            _ => {
-                let line = self.line;
-                self.unknown.get_or_insert_with(|| (line, excerpt(statement), 0)).2 += 1;
-                Ok(())
-            }
-        }
-    }
-
-    fn vertex(&mut self, rest: &str) -> Result<(), SceneError> {
-        let position = self.three_numbers("v", rest)?;
-        let number = self.positions.len() + 1;
-        if !position.is_finite() {
-            return Err(self.fault(GeometryFault::NotFinite { number, found: excerpt(rest.trim()) }));
-        }
-        if position.abs().max_element() > MAX_COORDINATE {
-            let found = excerpt(rest.trim());
-            return Err(self.fault(GeometryFault::TooFar { number, most: MAX_COORDINATE, found }));
-        }
-        self.room("vertices", self.positions.len(), MAX_VERTICES)?;
-        self.positions.push(position);
-        Ok(())
-    }
-
-    fn normal(&mut self, rest: &str) -> Result<(), SceneError> {
-        let normal = self.three_numbers("vn", rest)?;
-        self.room("normals", self.normals.len(), MAX_VERTICES)?;
-        // Zero stands for every unusable normal; the faces that use it get their own.
-        let usable = normal.is_finite() && normal.as_dvec3().length() > 1e-20;
-        let unit = if usable { normal.as_dvec3().normalize().as_vec3() } else { Vec3::ZERO };
-        self.normals.push(unit);
-        Ok(())
-    }
-
-    fn texture_coordinate(&mut self, rest: &str) -> Result<(), SceneError> {
-        let first = rest.split_whitespace().next().and_then(|word| word.parse::<f32>().ok());
-        if first.is_none() {
-            let found = excerpt(rest.trim());
-            return Err(self.fault(GeometryFault::Numbers { statement: "vt", needs: 1, found }));
-        }
-        self.room("texture coordinates", self.texture_coordinates, MAX_VERTICES)?;
-        self.texture_coordinates += 1;
-        Ok(())
-    }
-
-    fn three_numbers(&self, statement: &'static str, rest: &str) -> Result<Vec3, SceneError> {
-        let mut words = rest.split_ascii_whitespace();
-        let mut next = || words.next().and_then(|word| word.parse::<f32>().ok());
-        match (next(), next(), next()) {
-            (Some(x), Some(y), Some(z)) => Ok(Vec3::new(x, y, z)),
-            _ => {
-                let found = excerpt(rest.trim());
-                Err(self.fault(GeometryFault::Numbers { statement, needs: 3, found }))
-            }
-        }
-    }
-
-    fn room(&self, what: &'static str, count: usize, most: usize) -> Result<(), SceneError> {
-        if count < most { Ok(()) } else { Err(self.fault(GeometryFault::TooMany { what, most })) }
-    }
-
-    fn face(&mut self, rest: &'a str) -> Result<(), SceneError> {
-        let mut corners = std::mem::take(&mut self.corners);
-        corners.clear();
-        for word in rest.split_ascii_whitespace().take_while(|word| !word.starts_with('#')) {
-            corners.push(self.corner(word)?);
-        }
-        if corners.len() < 3 {
-            return Err(self.fault(GeometryFault::FewCorners { corners: corners.len() }));
-        }
-        let first = corners[0];
-        self.room("triangles", self.triangles.len() + corners.len() - 3, MAX_TRIANGLES)?;
-        let material = self.material();
-        if corners.len() > 3 {
-            self.polygons.push((self.triangles.len(), corners.len() - 2));
-        }
-        let fan = corners[1..].windows(2).map(|edge| ([first, edge[0], edge[1]], material));
-        self.triangles.extend(fan);
-        self.faces += 1;
-        self.corners = corners;
-        Ok(())
-    }
-
-    fn corner(&mut self, word: &str) -> Result<Corner, SceneError> {
-        const WHAT: [&str; 3] = ["vertex", "texture coordinate", "normal"];
-        let counts = [self.positions.len(), self.texture_coordinates, self.normals.len()];
-        let mut indices: [Option<i64>; 3] = [None; 3];
-        for (slot, part) in word.split('/').enumerate() {
-            let malformed = || self.fault(GeometryFault::Corner { corner: excerpt(word) });
-            // `v//vn` leaves the middle out; `v/` and `v//` end short, which exporters write too.
-            if part.is_empty() && slot > 0 {
-                continue;
-            }
-            let (what, count) = (*WHAT.get(slot).ok_or_else(malformed)?, counts[slot]);
-            let index: i64 = part.parse().map_err(|_| malformed())?;
-            let known = i64::try_from(count).unwrap_or(i64::MAX);
-            let from_zero = if index > 0 { index - 1 } else { known.saturating_add(index) };
-            // An index past 2^32 cannot become valid by vertices that follow.
-            if index == 0 || from_zero < 0 || from_zero >= i64::from(u32::MAX) {
-                return Err(self.fault(GeometryFault::Index { what, index, count }));
-            }
-            if from_zero >= self.largest[slot].index {
-                self.largest[slot] = Largest { index: from_zero, line: self.line, object: self.object };
-            }
-            indices[slot] = Some(from_zero);
-        }
-        let narrow = |index: i64| u32::try_from(index).expect("checked to be below 2^32 above");
-        match indices[0] {
-            None => Err(self.fault(GeometryFault::Corner { corner: excerpt(word) })),
-            Some(vertex) => {
-                Ok(Corner { vertex: narrow(vertex), normal: indices[2].map_or(NO_NORMAL, narrow) })
-            }
-        }
-    }
-
-    fn use_material(&mut self, name: &'a str) -> Result<(), SceneError> {
-        if name.is_empty() {
-            return Err(self.fault(GeometryFault::NoName { statement: "usemtl" }));
-        }
-        self.current = Some((name, self.line));
-        self.current_index = None;
-        Ok(())
-    }
-
-    /// Index of the current material, which a face now uses.
-    fn material(&mut self) -> u32 {
-        if let Some(index) = self.current_index {
-            return index;
-        }
-        let name = self.current.map(|(name, _)| name);
-        let index = self.material_indices.get(&name).copied().unwrap_or_else(|| {
-            let line = self.current.map_or(self.line, |(_, line)| line);
-            let object = self.object.map(ToOwned::to_owned);
-            let index = u32::try_from(self.materials.len())
-                .expect("fewer materials than lines, of which 2^32 do not fit");
-            self.materials.push(UsedMaterial { name: name.map(ToOwned::to_owned), line, object });
-            self.material_indices.insert(name, index);
-            index
-        });
-        self.current_index = Some(index);
-        index
-    }
-
-    fn check_indices(&mut self) -> Result<(), SceneError> {
-        let what = ["vertex", "texture coordinate", "normal"];
-        let counts = [self.positions.len(), self.texture_coordinates, self.normals.len()];
-        for ((largest, what), count) in self.largest.clone().into_iter().zip(what).zip(counts) {
-            // Line 0: no corner named one.
-            if largest.line > 0 && usize::try_from(largest.index).is_ok_and(|index| index >= count) {
-                (self.line, self.object) = (largest.line, largest.object);
-                return Err(self.fault(GeometryFault::Index { what, index: largest.index + 1, count }));
-            }
-        }
-        Ok(())
-    }
-
-    fn into_geometry(mut self) -> Result<Geometry, SceneError> {
-        // Of what faces use: a stray vertex far out must not make the rest look small.
-        let used =
-            self.triangles.iter().flat_map(|(corners, _)| corners).map(|c| self.positions[c.vertex as usize]);
-        let (low, high) = used
-            .fold((Vec3::MAX, Vec3::MIN), |(low, high), position| (low.min(position), high.max(position)));
-        let extent = (high - low).max_element();
-        let scale = if extent > 0.0 { extent.recip() } else { 1.0 };
-        let mut geometry = Geometry { concave: self.concave_polygons(), ..Geometry::default() };
-        geometry.triangles.reserve_exact(self.triangles.len());
-        for (corners, material) in std::mem::take(&mut self.triangles) {
-            let positions = corners.map(|corner| self.positions[corner.vertex as usize]);
-            let [a, b, c] = positions;
-            let cross = ((b - a) * scale).cross((c - a) * scale);
-            let squared = cross.length_squared();
-            if squared.is_nan() || squared <= LEAST_CROSS_SQUARED {
-                geometry.degenerate += 1;
-                continue;
-            }
-            let face = ((b - a).as_dvec3()).cross((c - a).as_dvec3()).normalize().as_vec3();
-            let mut replaced = 0;
-            let mut normals = corners.map(|corner| match self.normals.get(corner.normal as usize) {
-                None => face,
-                Some(&Vec3::ZERO) => {
-                    replaced += 1;
-                    face
-                }
-                Some(normal) => *normal,
-            });
-            geometry.replaced_normals += replaced;
-            if normals.iter().all(|normal| normal.dot(face) < 0.0) {
-                normals = normals.map(|normal| -normal);
-                geometry.turned_normals += 1;
-            }
-            geometry.triangles.push(Triangle { positions, normals, material });
+        let nameless = checked.materials.iter().position(|used| used.name.is_none());
+        let scale = inverse_extent(&meshes);
+        let mut geometry = Self {
+            triangles: Vec::with_capacity(checked.triangles),
+            materials: checked.materials,
+            libraries: checked.libraries,
+            warnings: checked.warnings,
+            ..Self::default()
+        };
+        for mesh in meshes {
+            let material = mesh.material_id.or(nameless).unwrap_or(0);
+            let material =
+                u32::try_from(material).expect("fewer materials than lines, of which 2^32 do not fit");
+            geometry.add_mesh(&mesh, material, scale);
         }
         if geometry.triangles.is_empty() {
-            let fault = GeometryFault::NoTriangle { faces: self.faces, degenerate: geometry.degenerate };
-            let place = super::error::Place { file: self.source.path.clone(), line: None };
-            return Err(SceneError::Geometry { place, object: None, fault });
+            let (faces, degenerate) = (checked.faces, geometry.degenerate);
+            return Err(refused(GeometryFault::NoTriangle { faces, degenerate }));
         }
-        if let Some((line, statement, count)) = self.unknown {
-            let place = self.source.line(line);
-            let warning = format!("{place}: {count} unknown statements ignored, the first is `{statement}`");
-            geometry.warnings.push(warning);
-        }
-        (geometry.materials, geometry.libraries) = (self.materials, self.libraries);
         Ok(geometry)
     }
 
-    /// Polygons of which a fan triangle winds against the whole.
-    fn concave_polygons(&self) -> usize {
-        let cross = |&(corners, _): &([Corner; 3], u32)| -> DVec3 {
-            let [a, b, c] = corners.map(|corner| self.positions[corner.vertex as usize].as_dvec3());
-            (b - a).cross(c - a)
-        };
-        let bends = |&&(start, count): &&(usize, usize)| {
-            let fan = &self.triangles[start..start + count];
-            let whole: DVec3 = fan.iter().map(cross).sum();
-            fan.iter().any(|triangle| cross(triangle).dot(whole) < -1e-9 * whole.length_squared())
-        };
-        self.polygons.iter().filter(bends).count()
+    fn add_mesh(&mut self, mesh: &Mesh, material: u32, scale: f32) {
+        let positions: Vec<Vec3> = points(&mesh.positions).collect();
+        let normals: Vec<Vec3> = points(&mesh.normals).map(unit).collect();
+        let indices = mesh.indices.iter().zip(&mesh.normal_indices);
+        let corners: Vec<Corner> = indices
+            .map(|(&vertex, &normal)| Corner {
+                position: positions[vertex as usize],
+                normal: normals[normal as usize],
+            })
+            .collect();
+        let mut rest = &corners[..];
+        let mut arities = mesh.face_arities.iter();
+        while !rest.is_empty() {
+            // A mesh without arities is all triangles.
+            let (polygon, others) = rest.split_at(arities.next().map_or(3, |&corners| corners as usize));
+            self.concave += usize::from(is_concave(polygon));
+            fan(polygon).for_each(|triangle| self.add_triangle(triangle, material, scale));
+            rest = others;
+        }
     }
+
+    fn add_triangle(&mut self, corners: [Corner; 3], material: u32, scale: f32) {
+        let positions = corners.map(|corner| corner.position);
+        let [a, b, c] = positions;
+        let cross = ((b - a) * scale).cross((c - a) * scale);
+        let squared = cross.length_squared();
+        if squared.is_nan() || squared <= LEAST_CROSS_SQUARED {
+            self.degenerate += 1;
+            return;
+        }
+        let face = ((b - a).as_dvec3()).cross((c - a).as_dvec3()).normalize().as_vec3();
+        let mut normals = corners.map(|Corner { normal, .. }| {
+            self.replaced_normals += usize::from(normal == Vec3::ZERO);
+            if normal == Vec3::ZERO || normal.is_nan() { face } else { normal }
+        });
+        if normals.iter().all(|normal| normal.dot(face) < 0.0) {
+            normals = normals.map(|normal| -normal);
+            self.turned_normals += 1;
+        }
+        self.triangles.push(Triangle { positions, normals, material });
+    }
+}
+
+/// The meshes of a checked file, its faces in their order. Faces before any `usemtl` have no material.
+fn read(checked: &Checked) -> Result<Vec<Mesh>, LoadError> {
+    let options =
+        LoadOptions { single_index: false, triangulate: false, ignore_points: true, ignore_lines: true };
+    let names = || {
+        let named = checked.materials.iter().enumerate();
+        named.filter_map(|(index, used)| Some((used.name.clone()?, index))).collect()
+    };
+    let mut text = checked.points.as_bytes().chain(checked.faces_text.as_bytes());
+    // What a name means is found later, where scene.toml has its say: the names and their numbers are enough.
+    let (models, _) = tobj::load_obj_buf(&mut text, &options, |_| Ok((Vec::new(), names())))?;
+    Ok(models.into_iter().map(|model| model.mesh).collect())
+}
+
+/// One over the longest edge of the box around what faces use: a stray vertex far out must not make the rest look small.
+fn inverse_extent(meshes: &[Mesh]) -> f32 {
+    let (low, high) = meshes
+        .iter()
+        .flat_map(|mesh| points(&mesh.positions))
+        .fold((Vec3::MAX, Vec3::MIN), |(low, high), position| (low.min(position), high.max(position)));
+    let extent = (high - low).max_element();
+    if extent > 0.0 { extent.recip() } else { 1.0 }
+}
+
+fn points(numbers: &[f32]) -> impl Iterator<Item = Vec3> {
+    numbers.chunks_exact(3).map(Vec3::from_slice)
+}
+
+/// A normal at unit length. Zero (the file's is unusable) and NaN (the file has none) stay.
+fn unit(normal: Vec3) -> Vec3 {
+    if normal == Vec3::ZERO { normal } else { normal.as_dvec3().normalize().as_vec3() }
+}
+
+fn fan(polygon: &[Corner]) -> impl Iterator<Item = [Corner; 3]> {
+    polygon[1..].windows(2).map(|edge| [polygon[0], edge[0], edge[1]])
+}
+
+/// Whether a triangle of the fan winds against the whole polygon.
+fn is_concave(polygon: &[Corner]) -> bool {
+    if polygon.len() == 3 {
+        return false;
+    }
+    let crosses = || {
+        fan(polygon).map(|corners| -> DVec3 {
+            let [a, b, c] = corners.map(|corner| corner.position.as_dvec3());
+            (b - a).cross(c - a)
+        })
+    };
+    let whole: DVec3 = crosses().sum();
+    crosses().any(|cross| cross.dot(whole) < -1e-9 * whole.length_squared())
 }
 
 #[cfg(test)]
@@ -411,6 +198,42 @@ mod tests {
         assert_eq!(windows.triangles, square.triangles);
         let textured = parse(&format!("{SQUARE}vt 0 0\nvn 0 0 2\nf 1/1/1 2/1/1 3//1 4/1")).unwrap();
         assert_eq!(textured.triangles, square.triangles);
+    }
+
+    #[test]
+    fn what_the_parser_alone_would_read_otherwise() {
+        let plain = parse(&format!("{SQUARE}f 1 2 3\nf 1 3 4")).unwrap().triangles;
+        for (what, text) in [
+            (
+                "a weight, a colour, half a colour",
+                "v 0 0 0 2\nv 1 0 0 .1 .2 .3\nv 1 1 0 1 1\nv 0 1 0\nf 1 2 3 4",
+            ),
+            ("comments behind statements", "v 0 0 0 # a\nv 1 0 0 # b\nv 1 1 0\nv 0 1 0\nf 1 2 3 4 # 5 6"),
+            ("groups before their vertices", &format!("g a\nf 1 2 3\ng b\nf 1 3 4\ng c\n{SQUARE}")),
+            ("polylines and points", &format!("{SQUARE}l 1 2 3 4 1\nl 1 2 3\np 1\nf 1 2 3 4")),
+            ("an old face, signs, tabs", &format!("{SQUARE}fo\t+1\t2\t3\nf\t-4\t-2\t-1")),
+            ("corners of every form", &format!("{SQUARE}vt 0\nvn 0 0 1\nf 1/ 2// 3/1\nf 1//1 3/1/-1 4")),
+            (
+                "a corner without a normal behind one",
+                &format!("{SQUARE}vn 1 0 .1\nf 1 2 3\nl 1//1 2\nf 1 3 4"),
+            ),
+        ] {
+            assert_eq!(parse(text).unwrap().triangles, plain, "{what}");
+        }
+        let mixed = parse(&format!("{SQUARE}vn 0.6 0 0.8\nf 1//1 2 3\nf 1 3//1 4")).unwrap();
+        let own = Vec3::new(0.6, 0.0, 0.8);
+        assert_eq!(mixed.triangles[0].normals, [own, Vec3::Z, Vec3::Z]);
+        assert_eq!((mixed.triangles[1].normals, mixed.replaced_normals), ([Vec3::Z, own, Vec3::Z], 0));
+    }
+
+    #[test]
+    fn meshes_end_and_the_order_of_faces_stays() {
+        // Three meshes, as the reader sees them, of faces that each use another corner first.
+        let faces: String = (0..150_000).map(|i| ["f 1 2 3\n", "f 2 3 4\n", "f 3 4 1\n"][i % 3]).collect();
+        let geometry = parse(&format!("{SQUARE}usemtl a\n{faces}")).unwrap();
+        assert_eq!((geometry.triangles.len(), geometry.materials.len()), (150_000, 1));
+        let firsts = [Vec3::ZERO, Vec3::X, Vec3::new(1.0, 1.0, 0.0)];
+        assert!(geometry.triangles.iter().enumerate().all(|(i, t)| t.positions[0] == firsts[i % 3]));
     }
 
     #[test]

@@ -124,7 +124,7 @@ impl CoordinatorMachine {
                 panic!("I8: jobs of {}, which left, are in line", pending.app)
             };
             for &key in &pending.keys {
-                if app.jobs.get(&key).is_some_and(|job| job.state == JobState::Waiting) {
+                if app.waiting_job(key, pending.batch).is_some() {
                     assert!(queued.insert((pending.app, key)), "I1: {} {key} is in line twice", pending.app);
                 }
             }

@@ -8,7 +8,7 @@ use crate::{
     device::{DeviceInfo, Requirements},
     id::{
         AppId, AppIncarnation, Attempt, BatchId, DeviceIndex, JobId, JobKey, LinkId, NodeId, NodeSession,
-        StealId, TaskId,
+        StealId,
     },
     message::{Contact, CostNs, JobFailure, WaitReason},
     time::Instant,
@@ -54,6 +54,13 @@ pub(super) struct App {
     pub(super) waiting_jobs: u64,
     pub(super) delivered_jobs: u64,
     pub(super) device_time_ns: u64,
+}
+
+impl App {
+    /// A job that waits in line with its batch. Keys stay in line when their jobs go; this tells them apart.
+    pub(super) fn waiting_job(&self, key: JobKey, batch: BatchId) -> Option<&Job> {
+        self.jobs.get(&key).filter(|job| job.state == JobState::Waiting && job.batch == batch)
+    }
 }
 
 /// What the jobs of one plan request share.
@@ -119,7 +126,6 @@ pub(super) struct Placement {
 #[derive(Debug)]
 pub(super) struct Pending {
     pub(super) app: AppId,
-    pub(super) task: TaskId,
     pub(super) batch: BatchId,
     /// Repeated in the plan: `None` for new attempts after a loss.
     pub(super) answers: Option<BatchId>,

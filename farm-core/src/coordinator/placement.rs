@@ -11,7 +11,7 @@ use super::{
 };
 use crate::{
     device::Requirements,
-    id::{AppId, Attempt, BatchId, DeviceIndex, JobAttempt, JobKey, NodeId},
+    id::{AppId, Attempt, BatchId, DeviceIndex, JobAttempt, JobKey, NodeId, TaskId},
     message::{CoordinatorToApp, CostNs, DevicePlan, NodePlan, Plan, PlanRequest, WaitReason},
     time::Instant,
 };
@@ -43,13 +43,14 @@ impl CoordinatorMachine {
             self.expel_app(id, reason);
             return;
         }
-        let intake = take_in(app, &request);
         // Asked again: whoever waits is told again.
-        let mut keys = if intake.known_batch { self.withdraw_pending(id, request.batch) } else { Vec::new() };
+        let mut keys = self.withdraw_pending(id, request.batch);
+        let Some(app) = self.apps.get_mut(&id) else { return };
+        let intake = take_in(app, &request);
         keys.extend(intake.fresh);
         if !keys.is_empty() {
-            let (batch, task) = (request.batch, request.task);
-            self.fresh.push_back(Pending { app: id, task, batch, answers: Some(batch), keys });
+            let batch = request.batch;
+            self.fresh.push_back(Pending { app: id, batch, answers: Some(batch), keys });
         }
         for key in intake.failed {
             self.repeat_failure(id, key);
@@ -60,8 +61,7 @@ impl CoordinatorMachine {
     pub(super) fn place_pending(&mut self, now: Instant) {
         // Jobs that lost their place came before anything that is new.
         for ((app, batch), keys) in std::mem::take(&mut self.lost).into_iter().rev() {
-            let Some(first) = keys.first() else { continue };
-            self.fresh.push_front(Pending { app, task: first.task, batch, answers: None, keys });
+            self.fresh.push_front(Pending { app, batch, answers: None, keys });
         }
         while let Some(pending) = self.fresh.pop_front() {
             self.place_batch(now, pending);
@@ -78,6 +78,16 @@ impl CoordinatorMachine {
     pub(super) fn forget_pending(&mut self, gone: impl Fn(&Pending) -> bool) {
         self.fresh.retain(|pending| !gone(pending));
         self.stuck.retain(|pending| !gone(pending));
+    }
+
+    /// Takes the jobs of a task out of line.
+    pub(super) fn forget_waiting(&mut self, id: AppId, task: TaskId) {
+        for queue in [&mut self.fresh, &mut self.stuck] {
+            for pending in queue.iter_mut().filter(|pending| pending.app == id) {
+                pending.keys.retain(|key| key.task != task);
+            }
+            queue.retain(|pending| !pending.keys.is_empty());
+        }
     }
 
     /// Says again where the application's jobs are.
@@ -109,7 +119,7 @@ impl CoordinatorMachine {
     fn place_batch(&mut self, now: Instant, mut pending: Pending) {
         let Some(app) = self.apps.get(&pending.app) else { return };
         let Some(batch) = app.batches.get(&pending.batch) else { return };
-        let wants = wanted(app, &pending.keys);
+        let wants = wanted(app, &pending);
         if wants.is_empty() {
             return;
         }
@@ -235,6 +245,9 @@ impl CoordinatorMachine {
     /// Takes the waiting jobs of a batch out of the queues.
     fn withdraw_pending(&mut self, id: AppId, batch: BatchId) -> Vec<JobKey> {
         let mut keys = Vec::new();
+        if !self.apps.get(&id).is_some_and(|app| app.batches.contains_key(&batch)) {
+            return keys;
+        }
         for queue in [&mut self.fresh, &mut self.stuck] {
             queue.retain_mut(|pending| {
                 let asked = pending.app == id && pending.batch == batch;
@@ -248,7 +261,7 @@ impl CoordinatorMachine {
         if let Some(waiting) = app.batches.get_mut(&batch) {
             waiting.told = None;
         }
-        keys.retain(|key| app.jobs.get(key).is_some_and(|job| job.state == JobState::Waiting));
+        keys.retain(|key| app.waiting_job(*key, batch).is_some());
         keys
     }
 }
@@ -286,14 +299,13 @@ struct Share {
 /// What a plan request consists of, seen from what is known.
 #[derive(Default)]
 struct Intake {
-    known_batch: bool,
     fresh: Vec<JobKey>,
     failed: Vec<JobKey>,
 }
 
 /// Enters the jobs of a request that are new; a repeated request (after a reconnect) changes nothing.
 fn take_in(app: &mut App, request: &PlanRequest) -> Intake {
-    let mut intake = Intake { known_batch: app.batches.contains_key(&request.batch), ..Intake::default() };
+    let mut intake = Intake::default();
     for planned in &request.jobs {
         let key = JobKey { task: request.task, index: planned.index };
         if app.failed.contains_key(&key) {
@@ -326,13 +338,13 @@ fn take_in(app: &mut App, request: &PlanRequest) -> Intake {
     intake
 }
 
-/// The jobs among `keys` that still wait, with their loads: a job of unknown cost counts as much as the mean of the known ones.
-fn wanted(app: &App, keys: &[JobKey]) -> Vec<Want> {
-    let mut wants = Vec::with_capacity(keys.len());
+/// The jobs of a batch in line that still wait, with their loads: a job of unknown cost counts as much as the mean of the known ones.
+fn wanted(app: &App, pending: &Pending) -> Vec<Want> {
+    let mut wants = Vec::with_capacity(pending.keys.len());
     let mut known = 0_u64;
     let mut known_ns = 0_u128;
-    for &key in keys {
-        let Some(job) = app.jobs.get(&key).filter(|job| job.state == JobState::Waiting) else { continue };
+    for &key in &pending.keys {
+        let Some(job) = app.waiting_job(key, pending.batch) else { continue };
         let load_ns = job.cost.0.min(MAX_LOAD_NS);
         if job.cost != CostNs(0) {
             known += 1;

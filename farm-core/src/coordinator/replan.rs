@@ -183,7 +183,7 @@ impl CoordinatorMachine {
             }
             self.forget_job(job);
         }
-        self.forget_pending(|pending| pending.app == id && pending.task == task);
+        self.forget_waiting(id, task);
         for (node, jobs) in on_nodes {
             self.tell_node(node, CoordinatorToNode::Cancel { jobs });
         }
@@ -241,17 +241,13 @@ impl CoordinatorMachine {
         if job.state == JobState::Waiting {
             app.waiting_jobs -= 1;
         }
-        let mut batch_over = false;
         if let Some(batch) = app.batches.get_mut(&job.batch) {
             batch.open_jobs -= 1;
             if batch.open_jobs == 0 {
                 app.batches.remove(&job.batch);
-                batch_over = true;
+                let batch = job.batch;
+                self.forget_pending(|pending| pending.app == id.app && pending.batch == batch);
             }
-        }
-        if batch_over && job.state == JobState::Waiting {
-            let batch = job.batch;
-            self.forget_pending(|pending| pending.app == id.app && pending.batch == batch);
         }
         self.release(id.app, key, job.state);
         Some(job)

@@ -1,6 +1,6 @@
 //! Contents that held jobs name: which are here, which are on their way, who waits for them. Bytes are the driver's.
 
-use std::time::Duration;
+use std::{collections::BTreeSet, time::Duration};
 
 use super::{Effect, WorkerMachine, job::HeldState};
 use crate::{
@@ -24,8 +24,8 @@ pub(super) struct Holding {
     pub(super) state: ContentState,
     /// Jobs that name it.
     pub(super) references: usize,
-    /// Jobs that wait for it, and some that ended while they did.
-    waiting: Vec<JobAttempt>,
+    /// Jobs that wait for it.
+    waiting: BTreeSet<JobAttempt>,
     failed_tries: u32,
 }
 
@@ -48,11 +48,11 @@ impl WorkerMachine {
             let holding = self.contents.entry(content.hash).or_insert_with(|| {
                 self.effects.push_back(Effect::Fetch { content, link });
                 let state = ContentState::Fetching(link);
-                Holding { content, state, references: 0, waiting: Vec::new(), failed_tries: 0 }
+                Holding { content, state, references: 0, waiting: BTreeSet::new(), failed_tries: 0 }
             });
             holding.references += 1;
             if holding.state != ContentState::Ready {
-                holding.waiting.push(job);
+                holding.waiting.insert(job);
                 missing += 1;
             }
         }
@@ -63,12 +63,10 @@ impl WorkerMachine {
         for content in contents {
             let Some(holding) = self.contents.get_mut(&content.hash) else { continue };
             holding.references -= 1;
+            holding.waiting.remove(&job);
             if holding.references == 0 {
                 self.contents.remove(&content.hash);
                 self.push(Effect::Release(content.hash));
-            } else if holding.waiting.len() > 2 * holding.references {
-                // Keeps the list in proportion when jobs are cancelled while they wait.
-                holding.waiting.retain(|waiting| *waiting != job && self.jobs.contains_key(&waiting.job));
             }
         }
     }

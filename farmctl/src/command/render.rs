@@ -9,16 +9,16 @@ use bdpt_kernel::{
     output::{self, Tone},
     scene::{self, LoadedScene, model::FilmSize},
 };
-use client_sdk::{Farm, FarmError, FarmOptions, RunSummary, TaskGraph};
+use client_sdk::{FarmError, FarmOptions, RunSummary};
 use serde_json::json;
-use tokio::signal::unix::{Signal, SignalKind, signal};
 
 use crate::{
     cli::{ProgressStyle, RenderArgs},
     embedded::EmbeddedFarm,
     failure::Failure,
     output::print_text,
-    progress::{self, Units},
+    progress::Units,
+    running::{Stops, run_graph},
 };
 
 /// Renders; the exit code is 0 only when every image is complete.
@@ -49,7 +49,15 @@ pub(crate) async fn run(arguments: &RenderArgs, coordinator: Option<&str>) -> Re
     };
     let address = own_farm.as_ref().map(EmbeddedFarm::grpc).or_else(|| coordinator.map(str::to_owned));
     let address = address.expect("either a coordinator is given or the own farm was started");
-    let result = run_on(&address, graph, &render, arguments, &mut stops).await;
+    let plan = render.plan();
+    #[expect(clippy::cast_precision_loss, reason = "a rate for people")]
+    let units = Units {
+        jobs: plan.tile_jobs() + u64::from(plan.light_jobs()),
+        total: plan.total_samples() as f64,
+        name: "samples",
+    };
+    let farm = FarmOptions::new(&address, app_name(&arguments.scene));
+    let result = run_graph(farm, graph, arguments.progress, units, &mut stops).await;
     let ended = finish(result, &render, arguments).await;
     if let Some(farm) = own_farm {
         tokio::select! {
@@ -68,47 +76,6 @@ fn report(loaded: &LoadedScene) {
     if loaded.report.warnings_dropped > 0 {
         eprintln!("farmctl: warning: {} further warnings", loaded.report.warnings_dropped);
     }
-}
-
-/// Runs the graph on the farm at `address`; the first signal stops it in order, the second one ends the process.
-async fn run_on(
-    address: &str,
-    graph: TaskGraph,
-    render: &RenderHandle,
-    arguments: &RenderArgs,
-    stops: &mut Stops,
-) -> Result<RunSummary, FarmError> {
-    let options =
-        FarmOptions { global_stealing: true, ..FarmOptions::new(address, app_name(&arguments.scene)) };
-    let farm = Farm::connect(options).await?;
-    let plan = render.plan();
-    #[expect(clippy::cast_precision_loss, reason = "a rate for people")]
-    let units = Units {
-        jobs: plan.tile_jobs() + u64::from(plan.light_jobs()),
-        total: plan.total_samples() as f64,
-        name: "samples",
-    };
-    let teller = tokio::spawn(progress::tell(farm.progress(), arguments.progress, units));
-    let stop = farm.stop_handle();
-    let result = {
-        let running = farm.run(graph);
-        tokio::pin!(running);
-        tokio::select! {
-            result = &mut running => result,
-            () = stops.recv() => {
-                eprintln!("farmctl: stopping; again to end at once");
-                stop.stop();
-                tokio::select! {
-                    result = &mut running => result,
-                    () = stops.recv() => std::process::exit(1),
-                }
-            }
-        }
-    };
-    farm.close().await;
-    // The progress channel closed with the farm: the teller ends by itself.
-    let _ = teller.await;
-    result
 }
 
 /// Writes the images of a complete render, or what there is of an incomplete one.
@@ -197,23 +164,4 @@ fn app_name(scene: &Path) -> String {
     let folder = if scene.is_file() { scene.parent().unwrap_or(scene) } else { scene };
     let name = folder.file_name().unwrap_or(folder.as_os_str());
     format!("render {}", name.to_string_lossy())
-}
-
-/// SIGINT and SIGTERM.
-struct Stops {
-    interrupt: Signal,
-    terminate: Signal,
-}
-
-impl Stops {
-    fn listen() -> Result<Self, Failure> {
-        Ok(Self { interrupt: signal(SignalKind::interrupt())?, terminate: signal(SignalKind::terminate())? })
-    }
-
-    async fn recv(&mut self) {
-        tokio::select! {
-            _ = self.interrupt.recv() => {}
-            _ = self.terminate.recv() => {}
-        }
-    }
 }

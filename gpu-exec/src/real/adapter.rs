@@ -3,7 +3,7 @@
 use std::{
     collections::BTreeSet,
     sync::{
-        Arc,
+        Arc, LazyLock,
         atomic::{AtomicBool, Ordering},
     },
 };
@@ -17,6 +17,10 @@ const CPU_MEMORY_BYTES: u64 = 2 << 30;
 /// Memory that a GPU may plan with where nothing better is known. wgpu 30 does not tell a heap's size; a smaller one
 /// answers an allocation too many with out of memory, and the job is retried elsewhere.
 const GPU_MEMORY_BYTES: u64 = 16 << 30;
+
+/// Lives as long as the process. The last instance to go would unload the driver, and NVIDIA's (580) then crashes the
+/// process when a thread that had used it ends: its thread-local destructors are gone.
+static INSTANCE: LazyLock<wgpu::Instance> = LazyLock::new(new_instance);
 
 /// An adapter of this machine.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -34,12 +38,12 @@ pub struct Adapter {
 /// Every Vulkan adapter of this machine, GPUs first, each once. Empty where there is no Vulkan.
 #[must_use]
 pub fn enumerate() -> Vec<Adapter> {
-    found().into_iter().map(|found| found.describe()).collect()
+    found(&INSTANCE).into_iter().map(Found::describe).collect()
 }
 
 /// What `all` stands for: every GPU, or the first software adapter where there is none.
 pub(crate) fn all() -> Result<Vec<DeviceSpec>, OpenError> {
-    let found = found();
+    let found = found(&INSTANCE);
     let gpus: Vec<_> =
         found.iter().map(|found| found.spec).filter(|spec| matches!(spec, DeviceSpec::Gpu(_))).collect();
     match (gpus.is_empty(), found.first()) {
@@ -63,9 +67,18 @@ pub(crate) struct Gpu {
 }
 
 impl Gpu {
-    /// Opens the adapter that `spec` names, on a fresh instance.
+    /// Opens the adapter that `spec` names.
     pub(crate) fn open(spec: DeviceSpec) -> Result<Self, OpenError> {
-        let mut adapters = found();
+        Self::open_on(&INSTANCE, spec)
+    }
+
+    /// Opens the adapter again after its device was lost or hung: on an instance of its own.
+    pub(crate) fn reopen(spec: DeviceSpec) -> Result<Self, OpenError> {
+        Self::open_on(&new_instance(), spec)
+    }
+
+    fn open_on(instance: &wgpu::Instance, spec: DeviceSpec) -> Result<Self, OpenError> {
+        let mut adapters = found(instance);
         if adapters.is_empty() {
             return Err(OpenError::NoAdapter { spec });
         }
@@ -177,13 +190,7 @@ impl Found {
 }
 
 /// The machine's adapters: GPUs in the loader's order, then the first software adapter.
-fn found() -> Vec<Found> {
-    let instance = wgpu::Instance::new(wgpu::InstanceDescriptor {
-        backends: wgpu::Backends::VULKAN,
-        // Validation layers are for wgpu's own developers; wgpu validates all calls itself.
-        flags: wgpu::InstanceFlags::empty(),
-        ..wgpu::InstanceDescriptor::new_without_display_handle()
-    });
+fn found(instance: &wgpu::Instance) -> Vec<Found> {
     let adapters = pollster::block_on(instance.enumerate_adapters(wgpu::Backends::VULKAN));
     let (mut gpus, mut software) = (Vec::new(), None);
     // Two drivers for one card (NVIDIA's and nouveau's, amdvlk and radv) give it twice; it has one PCI address.
@@ -198,6 +205,15 @@ fn found() -> Vec<Found> {
     }
     gpus.extend(software);
     gpus
+}
+
+fn new_instance() -> wgpu::Instance {
+    wgpu::Instance::new(wgpu::InstanceDescriptor {
+        backends: wgpu::Backends::VULKAN,
+        // Validation layers are for wgpu's own developers; wgpu validates all calls itself.
+        flags: wgpu::InstanceFlags::empty(),
+        ..wgpu::InstanceDescriptor::new_without_display_handle()
+    })
 }
 
 fn kind_of(info: &wgpu::AdapterInfo) -> DeviceKind {

@@ -228,7 +228,7 @@ impl DeviceThread {
     fn replace_device(&mut self, reason: &Hung) -> Result<(), String> {
         tracing::warn!(spec = %self.spec, reason = reason.0, "replacing the device");
         self.fail_running(reason);
-        let opened = Gpu::open(self.spec);
+        let opened = Gpu::reopen(self.spec);
         let gpu = opened.map_err(|error| format!("{}; it does not open again: {error}", reason.0))?;
         let mut old = mem::replace(&mut self.state, State::new(gpu, &self.config));
         let staged = old.staged.take().map(|(order, _)| order);

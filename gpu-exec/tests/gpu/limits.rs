@@ -4,6 +4,7 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use farm_core::{
+    device::DeviceKind,
     id::ContentHash,
     message::{CostNs, JobFailure},
     program::{JobProgram, Slicing},
@@ -149,8 +150,8 @@ fn measure_how_busy_slices_keep_the_device() {
     let info = device.executor.info();
     println!("{}: score {:.0} GFLOP/s", info.name, info.score);
     // The scratch of a real kernel bounds its slices; 16 layers of 64 workgroups is what a small tile has.
-    for (x, layers) in [(64, 2_000), (1_024, 2_000)] {
-        let layers = if info.kind == farm_core::device::DeviceKind::Gpu { 8 * layers } else { layers / 100 };
+    let gpu = info.kind == DeviceKind::Gpu;
+    for (x, layers) in if gpu { [(64, 8_000), (1_024, 4_000)] } else { [(8, 40), (64, 20)] } {
         for _ in 0..2 {
             let (program, contents) = spin([x, 1, layers], true);
             let order = device.order(program, &contents);

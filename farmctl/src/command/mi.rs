@@ -1,0 +1,266 @@
+//! `farmctl mi`: an alignment in, mutual information with its null model out, through a farm.
+
+use std::{
+    fs,
+    io::{self, BufWriter, Write as _},
+    path::{Path, PathBuf},
+    sync::Arc,
+    time::Duration,
+};
+
+use anyhow::{Context as _, anyhow};
+use client_sdk::{FarmError, FarmOptions, RunSummary};
+use mi_kernel::{
+    Accumulators, Alignment, NullModel, Reference, Seed, ShuffleKind,
+    job::{MiHandle, MiOptions, Mode, mi_graph},
+    output, parse, saved,
+};
+use serde_json::json;
+
+use crate::{
+    cli::{MiArgs, MiMode, ProgressStyle},
+    embedded::EmbeddedFarm,
+    failure::Failure,
+    output::print_text,
+    progress::Units,
+    running::{Stops, run_graph},
+};
+
+/// Raw sums in the folder: what `--extend` goes on from.
+const SUMS: &str = "sums.bin";
+
+/// The alignment as read, and what is known of its file.
+#[derive(Debug)]
+struct Input {
+    alignment: Arc<Alignment>,
+    format: String,
+    blake3: String,
+    earlier: Option<Accumulators>,
+}
+
+/// Computes; the exit code is 0 only when every iteration is in the results.
+pub(crate) async fn run(arguments: &MiArgs, coordinator: Option<&str>) -> Result<(), Failure> {
+    let mut stops = Stops::listen()?;
+    let input = read(arguments)?;
+    let options = MiOptions {
+        iterations: arguments.iterations,
+        seed: Seed(arguments.seed),
+        mode: match arguments.mode {
+            MiMode::Reduce => Mode::Reduce,
+            MiMode::Matrix => Mode::Matrix,
+        },
+        earlier: input.earlier.clone(),
+    };
+    let before = input.earlier.as_ref().map_or(0, Accumulators::iterations);
+    let (graph, handle) =
+        mi_graph(Arc::clone(&input.alignment), options).with_context(|| shown(&arguments.alignment))?;
+    let own_farm = match coordinator {
+        Some(_) => None,
+        None => Some(tokio::select! {
+            farm = EmbeddedFarm::start(&arguments.devices) => farm?,
+            () = stops.recv() => return Err(anyhow!("interrupted before the first job: nothing was written").into()),
+        }),
+    };
+    let address = own_farm.as_ref().map(EmbeddedFarm::grpc).or_else(|| coordinator.map(str::to_owned));
+    let address = address.expect("either a coordinator is given or the own farm was started");
+    #[expect(clippy::cast_precision_loss, reason = "a rate for people")]
+    let units = Units {
+        jobs: handle.jobs(),
+        total: arguments.iterations.saturating_sub(before as u64) as f64,
+        name: "iterations",
+    };
+    let name = arguments.alignment.file_name().unwrap_or(arguments.alignment.as_os_str());
+    let farm = FarmOptions::new(&address, format!("mi {}", name.to_string_lossy()));
+    let result = run_graph(farm, graph, arguments.progress, units, &mut stops).await;
+    let ended = finish(result, &input, &handle, arguments, before).await;
+    if let Some(farm) = own_farm {
+        tokio::select! {
+            () = farm.stop() => {}
+            () = stops.recv() => {}
+        }
+    }
+    ended
+}
+
+fn shown(path: &Path) -> String {
+    path.display().to_string()
+}
+
+/// Reads the alignment and, where asked, the sums to go on from; the folder is there afterwards.
+fn read(arguments: &MiArgs) -> Result<Input, Failure> {
+    let bytes = fs::read(&arguments.alignment).with_context(|| shown(&arguments.alignment))?;
+    let parsed = parse(&bytes).with_context(|| shown(&arguments.alignment))?;
+    eprintln!("farmctl: {}: {}, {}", shown(&arguments.alignment), parsed.notes.format, parsed.alignment);
+    if parsed.notes.duplicate_names > 0 {
+        eprintln!("farmctl: warning: {} names occur more than once", parsed.notes.duplicate_names);
+    }
+    fs::create_dir_all(&arguments.folder).with_context(|| shown(&arguments.folder))?;
+    let path = arguments.folder.join(SUMS);
+    let earlier = match (fs::read(&path), arguments.extend) {
+        (Ok(_), false) => {
+            let reason = anyhow!(
+                "{} is there already: --extend goes on from it, another folder begins anew",
+                shown(&path)
+            );
+            return Err(Failure::Usage(reason));
+        }
+        (Ok(sums), true) => {
+            Some(saved::load(&parsed.alignment, Seed(arguments.seed), &sums).with_context(|| shown(&path))?)
+        }
+        (Err(error), false) if error.kind() == io::ErrorKind::NotFound => None,
+        (Err(error), _) => return Err(anyhow::Error::new(error).context(shown(&path)).into()),
+    };
+    Ok(Input {
+        alignment: Arc::new(parsed.alignment),
+        format: parsed.notes.format.to_string(),
+        blake3: blake3::hash(&bytes).to_hex().to_string(),
+        earlier,
+    })
+}
+
+/// Writes the results of a complete run, or what there is of an incomplete one.
+async fn finish(
+    result: Result<RunSummary, FarmError>,
+    input: &Input,
+    handle: &MiHandle,
+    arguments: &MiArgs,
+    before: usize,
+) -> Result<(), Failure> {
+    let (summary, failure) = match result {
+        Ok(summary) => (summary, None),
+        Err(error @ (FarmError::Unreachable { .. } | FarmError::CoordinatorLost { .. })) => {
+            (RunSummary::default(), Some(Failure::Unreachable(error.into())))
+        }
+        Err(error) => (RunSummary::default(), Some(Failure::Work(error.into()))),
+    };
+    let done = handle.iterations_done();
+    let Some(observed) = handle.observed().filter(|_| failure.is_none() || done > before) else {
+        eprintln!("farmctl: no iteration was added: nothing was written");
+        return Err(failure.unwrap_or_else(|| anyhow!("the run gave no scores").into()));
+    };
+    let results = Results {
+        alignment: Arc::clone(&input.alignment),
+        seed: Seed(arguments.seed),
+        observed,
+        sums: handle.sums(),
+        folder: arguments.folder.clone(),
+        top: arguments.top.unwrap_or(input.alignment.l() * 5),
+    };
+    let record = json!({
+        "input": shown(&arguments.alignment),
+        "input_blake3": input.blake3,
+        "format": input.format,
+        "sequences": input.alignment.n(),
+        "columns": input.alignment.l(),
+        "alphabet": String::from_utf8_lossy(input.alignment.alphabet()),
+        "gap_share": input.alignment.gap_share(),
+        "gaps": "an ordinary symbol (ORMI)",
+        "units": "bits",
+        "seed": arguments.seed,
+        "iterations": done,
+        "iterations_asked": arguments.iterations,
+        "complete": failure.is_none(),
+        "null_model": "columns shuffled by keyed Feistel permutations, 8 rounds",
+        "mode": match arguments.mode { MiMode::Reduce => "reduce", MiMode::Matrix => "matrix" },
+        "version": env!("CARGO_PKG_VERSION"),
+        "nodes": handle.nodes().iter().map(ToString::to_string).collect::<Vec<_>>(),
+        "jobs": summary.jobs,
+        "replanned": summary.replanned,
+        "wall_seconds": summary.wall_time.as_secs_f64(),
+        "device_seconds": summary.device_time.as_secs_f64(),
+    });
+    let best =
+        tokio::task::spawn_blocking(move || results.write(&record)).await.context("writing panicked")??;
+    if let Some(failure) = failure {
+        eprintln!(
+            "farmctl: saved a partial result in {}: {done} of {} iterations; --extend goes on from it",
+            shown(&arguments.folder),
+            arguments.iterations
+        );
+        return Err(failure);
+    }
+    tell(&summary, arguments, done - before, &best)
+}
+
+fn tell(summary: &RunSummary, arguments: &MiArgs, added: usize, best: &str) -> Result<(), Failure> {
+    let prepare: Duration = summary.tasks.iter().map(|task| task.prepare_time).sum();
+    let seconds = summary.wall_time.saturating_sub(prepare).as_secs_f64();
+    if arguments.progress == ProgressStyle::Ndjson {
+        let line = json!({
+            "event": "done",
+            "iterations": arguments.iterations,
+            "iterations_added": added,
+            "jobs": summary.jobs,
+            "replanned": summary.replanned,
+            "seconds": seconds,
+            "device_seconds": summary.device_time.as_secs_f64(),
+        });
+        print_text(&format!("{line}\n"))?;
+    }
+    eprintln!(
+        "farmctl: {} written: {added} iterations in {} jobs, {seconds:.1} s{}; {best}",
+        shown(&arguments.folder),
+        summary.jobs,
+        if summary.replanned > 0 { format!(", {} replanned", summary.replanned) } else { String::new() },
+    );
+    Ok(())
+}
+
+/// Everything that the files are made of.
+struct Results {
+    alignment: Arc<Alignment>,
+    seed: Seed,
+    observed: Vec<i32>,
+    sums: Accumulators,
+    folder: PathBuf,
+    top: usize,
+}
+
+impl Results {
+    /// Writes all files, the sums last: whoever finds them finds the others. Gives the top pair in words.
+    fn write(self, record: &serde_json::Value) -> anyhow::Result<String> {
+        let reference = Reference::with_observed(&self.alignment, self.observed)?;
+        let null = NullModel::new(&reference, self.seed, ShuffleKind::Feistel);
+        let pairs = self.sums.statistics(&null);
+        let l = self.alignment.l();
+        for (name, matrix) in output::matrices(&reference, &pairs) {
+            place(&self.folder, &format!("{name}.npy"), |out| output::write_npy(out, l, &matrix))?;
+            if let "mi_bits" | "z" = name {
+                let picture = output::heat_map(l, &matrix)?;
+                place(&self.folder, &format!("{name}.png"), |out| out.write_all(&picture))?;
+            }
+        }
+        place(&self.folder, "pairs.csv", |out| {
+            output::write_top_pairs(out, &self.alignment, &pairs, self.top)
+        })?;
+        let text = serde_json::to_string_pretty(record)? + "\n";
+        place(&self.folder, "run.json", |out| out.write_all(text.as_bytes()))?;
+        let sums = saved::save(&self.alignment, self.seed, &self.sums);
+        place(&self.folder, SUMS, |out| out.write_all(&sums))?;
+        let best = pairs.iter().max_by(|a, b| a.z.total_cmp(&b.z));
+        Ok(best.map_or_else(String::new, |best| {
+            format!("highest Z {:.1}: columns {} and {}", best.z, best.i + 1, best.j + 1)
+        }))
+    }
+}
+
+/// Writes a file of the folder, whole or not at all.
+fn place(
+    folder: &Path,
+    name: &str,
+    write: impl FnOnce(&mut BufWriter<fs::File>) -> io::Result<()>,
+) -> anyhow::Result<()> {
+    let path = folder.join(name);
+    let unfinished = folder.join(format!(".{name}.{}", std::process::id()));
+    let written = fs::File::create(&unfinished).and_then(|file| {
+        let mut out = BufWriter::new(file);
+        write(&mut out)?;
+        out.into_inner().map_err(io::IntoInnerError::into_error)?.sync_all()?;
+        fs::rename(&unfinished, &path)
+    });
+    if written.is_err() {
+        // What is left of it is of no use; that it cannot be removed either changes nothing.
+        let _ = fs::remove_file(&unfinished);
+    }
+    written.with_context(|| shown(&path))
+}

@@ -1,0 +1,405 @@
+//! The null model as an application of the farm: a task of one job that scores the alignment as it is, and one of jobs
+//! over ranges of iterations after it.
+//!
+//! Owns how iterations become jobs and how results are summed. What a job computes is `gpu`'s. Never knows where a job
+//! runs; integer sums make that invisible in the result.
+
+use std::{
+    collections::{BTreeSet, VecDeque},
+    ops::Range,
+    sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError},
+};
+
+use client_sdk::{
+    Content, DispatchError, Job, JobProgram, JobResult, NodeId, RetrieveError, Task, TaskData, TaskError,
+    TaskGraph, TaskProgress,
+};
+use thiserror::Error;
+
+use crate::{
+    Accumulators, Alignment, Reference, ReferenceError, Seed,
+    gpu::{AlignmentContents, MiJob, PackedAlignment, Pass, Shape, ShapeError, module_source},
+    pair_count,
+};
+
+/// Name of the task that scores the alignment as it is.
+pub const OBSERVED_TASK: &str = "observed";
+/// Name of the task of the null model.
+pub const NULL_TASK: &str = "null";
+
+/// Most iterations of one run.
+pub const MAX_ITERATIONS: u64 = 10_000_000;
+
+/// Most bytes of results of jobs in flight, apart from the one that always is.
+const FLIGHT_BYTES: u64 = 2 << 30;
+/// Most jobs in flight.
+const FLIGHT_JOBS: usize = 256;
+/// Counts (pairs times sequences times iterations) of a job, where the run is long enough: two seconds of an H200.
+const JOB_COUNTS: u64 = 2_000_000_000_000;
+/// Jobs that a run has at least, where it has as many iterations.
+const LEAST_JOBS: u64 = 64;
+/// Most iterations of a job.
+const JOB_ITERATIONS: u64 = 256;
+/// Most commands that a job's iterations make; `gpu::MiJob` checks the same.
+const JOB_COMMANDS: u64 = 3_500;
+/// Most bytes of a job's matrices.
+const JOB_MATRIX_BYTES: u64 = 256 << 20;
+
+/// What jobs bring back.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Mode {
+    /// Sums over a job's iterations.
+    Reduce,
+    /// Every iteration's matrix, as the thesis has it; the sums are the host's. The same final bytes.
+    Matrix,
+}
+
+/// What to compute of an alignment.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct MiOptions {
+    /// Iterations of the null model in the end, 0..=10,000,000: those with numbers 0..iterations.
+    pub iterations: u64,
+    /// The same seed gives the same result.
+    pub seed: Seed,
+    /// What jobs bring back.
+    pub mode: Mode,
+    /// Sums of an earlier run; the iterations in them are not computed again.
+    pub earlier: Option<Accumulators>,
+}
+
+/// A run that cannot start.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Error)]
+pub enum MiError {
+    /// Too many iterations.
+    #[error("{iterations} iterations: at most {MAX_ITERATIONS}")]
+    Iterations {
+        /// What was asked for.
+        iterations: u64,
+    },
+    /// The earlier sums hold iterations that were not asked for.
+    #[error("the earlier sums hold iteration {held}, past the {iterations} asked for")]
+    Earlier {
+        /// The last iteration held, from 0.
+        held: u64,
+        /// What was asked for.
+        iterations: u64,
+    },
+    /// The earlier sums are of another number of columns.
+    #[error("the earlier sums are of another alignment")]
+    OtherSums,
+    /// An alignment that devices cannot hold.
+    #[error(transparent)]
+    Shape(#[from] ShapeError),
+    /// An alignment that the fixed point cannot hold.
+    #[error(transparent)]
+    Reference(#[from] ReferenceError),
+}
+
+/// A view of a run from outside.
+#[derive(Clone, Debug)]
+pub struct MiHandle {
+    shared: Arc<Shared>,
+    jobs: u64,
+}
+
+impl MiHandle {
+    /// Jobs of the run.
+    #[must_use]
+    pub fn jobs(&self) -> u64 {
+        self.jobs
+    }
+
+    /// Iterations in the sums so far, those of an earlier run included.
+    #[must_use]
+    pub fn iterations_done(&self) -> usize {
+        self.shared.sums().iterations()
+    }
+
+    /// Nodes that results came from.
+    #[must_use]
+    pub fn nodes(&self) -> BTreeSet<NodeId> {
+        self.shared.nodes.lock().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+
+    /// Observed scores, once they are there.
+    #[must_use]
+    pub fn observed(&self) -> Option<Vec<i32>> {
+        self.shared.observed.get().cloned()
+    }
+
+    /// The sums of what has come so far: complete after the run, valid at any time.
+    #[must_use]
+    pub fn sums(&self) -> Accumulators {
+        self.shared.sums().clone()
+    }
+}
+
+/// The tasks of a run, and a handle on its sums.
+///
+/// # Errors
+/// The alignment or the options are out of range.
+pub fn mi_graph(alignment: Arc<Alignment>, options: MiOptions) -> Result<(TaskGraph, MiHandle), MiError> {
+    let shape = Shape::new(&alignment)?;
+    Reference::unscored(&alignment)?;
+    let MiOptions { iterations, seed, mode, earlier } = options;
+    if iterations > MAX_ITERATIONS {
+        return Err(MiError::Iterations { iterations });
+    }
+    let sums = earlier.unwrap_or_else(|| Accumulators::new(alignment.l()));
+    if sums.sum().len() != pair_count(alignment.l()) {
+        return Err(MiError::OtherSums);
+    }
+    if let Some((held, _)) = sums.maxima().last_key_value().filter(|(held, _)| **held >= iterations) {
+        return Err(MiError::Earlier { held: *held, iterations });
+    }
+    let ranges = missing(&sums, iterations, job_iterations(&shape, mode, iterations));
+    let jobs = ranges.len() as u64 + 1;
+    let shared = Arc::new(Shared {
+        alignment,
+        shape,
+        contents: OnceLock::new(),
+        observed: OnceLock::new(),
+        observed_contents: OnceLock::new(),
+        sums: Mutex::new(sums),
+        nodes: Mutex::new(BTreeSet::new()),
+    });
+    let observed = ObservedTask { shared: Arc::clone(&shared) };
+    let null = NullTask { ranges, seed, mode, shared: Arc::clone(&shared) };
+    let graph =
+        TaskGraph::new().task(OBSERVED_TASK, observed).task(NULL_TASK, null).after(NULL_TASK, OBSERVED_TASK);
+    Ok((graph, MiHandle { shared, jobs }))
+}
+
+/// Iterations of one job: long enough for a fast device, short enough that many devices share the run.
+fn job_iterations(shape: &Shape, mode: Mode, iterations: u64) -> u64 {
+    let pairs = shape.pairs() as u64;
+    let long = JOB_COUNTS / (pairs * u64::from(shape.rows())).max(1);
+    let commands = JOB_COMMANDS / (4 + 3 * shape.chunks().len() as u64);
+    let held = match mode {
+        Mode::Reduce => JOB_ITERATIONS,
+        Mode::Matrix => JOB_MATRIX_BYTES / (pairs * 4),
+    };
+    long.min(iterations.div_ceil(LEAST_JOBS)).min(JOB_ITERATIONS).min(commands).min(held).max(1)
+}
+
+/// The iterations of `0..iterations` that are not in the sums, in ranges of at most `most`.
+fn missing(sums: &Accumulators, iterations: u64, most: u64) -> VecDeque<Range<u64>> {
+    let mut ranges = VecDeque::new();
+    let mut start = 0;
+    for held in sums.maxima().keys().copied().chain([iterations]) {
+        while start < held {
+            let end = held.min(start + most);
+            ranges.push_back(start..end);
+            start = end;
+        }
+        start = held + 1;
+    }
+    ranges
+}
+
+/// What the jobs, the tasks and the handle share.
+#[derive(Debug)]
+struct Shared {
+    alignment: Arc<Alignment>,
+    shape: Shape,
+    contents: OnceLock<AlignmentContents>,
+    observed: OnceLock<Vec<i32>>,
+    observed_contents: OnceLock<Vec<Content>>,
+    /// A lock, not an owner with messages: jobs are retrieved on the run's own threads and must know that their sums
+    /// were taken before they say so; the handle reads between two of them. Held for one merge or one copy.
+    sums: Mutex<Accumulators>,
+    /// As `sums`; held for one insertion.
+    nodes: Mutex<BTreeSet<NodeId>>,
+}
+
+impl Shared {
+    fn sums(&self) -> MutexGuard<'_, Accumulators> {
+        self.sums.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn contents(&self) -> Result<&AlignmentContents, DispatchError> {
+        self.contents.get().ok_or_else(|| out_of_order(OBSERVED_TASK))
+    }
+
+    fn note(&self, node: NodeId) {
+        self.nodes.lock().unwrap_or_else(PoisonError::into_inner).insert(node);
+    }
+}
+
+fn out_of_order(task: &str) -> DispatchError {
+    DispatchError::Application(format!("task `{task}` has not run"))
+}
+
+/// Packs the alignment and scores it as it is.
+#[derive(Debug)]
+struct ObservedTask {
+    shared: Arc<Shared>,
+}
+
+impl Task for ObservedTask {
+    fn prepare(&mut self, data: &mut TaskData) -> Result<(), TaskError> {
+        let reference = Reference::unscored(&self.shared.alignment).map_err(TaskError::application)?;
+        let packed = PackedAlignment::new(&reference, &self.shared.shape);
+        let contents = AlignmentContents {
+            codes: data.allocation(packed.codes),
+            orders: packed.orders.into_iter().map(|order| data.allocation(order)).collect(),
+            bounds: data.allocation(packed.bounds),
+            table: data.allocation(packed.table),
+            column_terms: data.allocation(packed.column_terms),
+            module: data.module(module_source(self.shared.shape.symbols())),
+        };
+        self.shared
+            .contents
+            .set(contents)
+            .map_err(|_| TaskError::application("the alignment was packed before"))
+    }
+
+    fn jobs(&mut self) -> Vec<Box<dyn Job>> {
+        vec![Box::new(ObservedJob { shared: Arc::clone(&self.shared) })]
+    }
+}
+
+#[derive(Debug)]
+struct ObservedJob {
+    shared: Arc<Shared>,
+}
+
+/// Nothing is drawn: the seed does not matter.
+const OBSERVED: MiJob = MiJob { seed: Seed(0), pass: Pass::Observed };
+
+impl Job for ObservedJob {
+    fn dispatch(&mut self, cmd: &mut JobProgram) -> Result<(), DispatchError> {
+        OBSERVED.program(&self.shared.shape, self.shared.contents()?, &[], cmd)
+    }
+
+    fn retrieve(&mut self, result: JobResult) -> Result<(), RetrieveError> {
+        let scores =
+            OBSERVED.scores(&self.shared.shape, &result.sections).map_err(RetrieveError::application)?;
+        self.shared.note(result.node);
+        let scores = scores.into_iter().next().unwrap_or_default();
+        self.shared.observed.set(scores).map_err(|_| RetrieveError::application("scored twice"))
+    }
+}
+
+/// The iterations.
+#[derive(Debug)]
+struct NullTask {
+    ranges: VecDeque<Range<u64>>,
+    seed: Seed,
+    mode: Mode,
+    shared: Arc<Shared>,
+}
+
+impl NullTask {
+    fn next_jobs(&mut self, in_flight: u64) -> Vec<Box<dyn Job>> {
+        let pairs = self.shared.shape.pairs() as u64;
+        let job_bytes = match self.mode {
+            Mode::Reduce => pairs * 20,
+            Mode::Matrix => self.ranges.front().map_or(0, |range| (range.end - range.start) * pairs * 4),
+        };
+        let room =
+            usize::try_from(FLIGHT_BYTES / job_bytes.max(1)).unwrap_or(FLIGHT_JOBS).clamp(2, FLIGHT_JOBS);
+        let room = room.saturating_sub(usize::try_from(in_flight).unwrap_or(usize::MAX));
+        let ranges = self.ranges.drain(..room.min(self.ranges.len()));
+        let (seed, mode, shared) = (self.seed, self.mode, &self.shared);
+        ranges
+            .map(|range| {
+                let pass = match mode {
+                    Mode::Reduce => Pass::Reduce(range),
+                    Mode::Matrix => Pass::Matrix(range),
+                };
+                Box::new(NullJob { job: MiJob { seed, pass }, shared: Arc::clone(shared) }) as Box<dyn Job>
+            })
+            .collect()
+    }
+}
+
+impl Task for NullTask {
+    fn prepare(&mut self, data: &mut TaskData) -> Result<(), TaskError> {
+        let observed =
+            self.shared.observed.get().ok_or_else(|| TaskError::application("nothing was scored"))?;
+        let contents = self
+            .shared
+            .shape
+            .observed_bytes(observed)
+            .into_iter()
+            .map(|bytes| data.allocation(bytes))
+            .collect();
+        self.shared
+            .observed_contents
+            .set(contents)
+            .map_err(|_| TaskError::application("the scores were named before"))
+    }
+
+    fn jobs(&mut self) -> Vec<Box<dyn Job>> {
+        self.next_jobs(0)
+    }
+
+    fn more_jobs(&mut self, progress: &TaskProgress) -> Vec<Box<dyn Job>> {
+        self.next_jobs(progress.jobs_known - progress.jobs_done)
+    }
+}
+
+#[derive(Debug)]
+struct NullJob {
+    job: MiJob,
+    shared: Arc<Shared>,
+}
+
+impl Job for NullJob {
+    fn dispatch(&mut self, cmd: &mut JobProgram) -> Result<(), DispatchError> {
+        let observed = self.shared.observed_contents.get().ok_or_else(|| out_of_order(OBSERVED_TASK))?;
+        self.job.program(&self.shared.shape, self.shared.contents()?, observed, cmd)
+    }
+
+    fn retrieve(&mut self, result: JobResult) -> Result<(), RetrieveError> {
+        let observed =
+            self.shared.observed.get().ok_or_else(|| RetrieveError::application("nothing was scored"))?;
+        let sums = self
+            .job
+            .sums(&self.shared.shape, observed, &result.sections)
+            .map_err(RetrieveError::application)?;
+        self.shared.note(result.node);
+        self.shared.sums().merge(sums).map_err(RetrieveError::application)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{NullModel, ShuffleKind, parse};
+
+    fn options(iterations: u64, earlier: Option<Accumulators>) -> MiOptions {
+        MiOptions { iterations, seed: Seed(1), mode: Mode::Reduce, earlier }
+    }
+
+    #[test]
+    fn what_is_missing_is_computed_once() {
+        let alignment = Arc::new(parse(b"ACA\nACC\nGTA\nGTC\n").unwrap().alignment);
+        let reference = Reference::new(&alignment).unwrap();
+        let null = NullModel::new(&reference, Seed(1), ShuffleKind::Feistel);
+        let mut sums = null.run(0..3).unwrap();
+        sums.merge(null.run(7..8).unwrap()).unwrap();
+        assert_eq!(missing(&sums, 12, 3), [3..6, 6..7, 8..11, 11..12]);
+        assert_eq!(
+            missing(&sums, 8, 100),
+            [3..7, 7..7].into_iter().filter(|r| !r.is_empty()).collect::<Vec<_>>()
+        );
+        let error = mi_graph(Arc::clone(&alignment), options(7, Some(sums.clone()))).unwrap_err();
+        assert_eq!(error, MiError::Earlier { held: 7, iterations: 7 });
+        let error = mi_graph(Arc::clone(&alignment), options(7, Some(Accumulators::new(9)))).unwrap_err();
+        assert_eq!(error, MiError::OtherSums);
+        let (_, handle) = mi_graph(alignment, options(12, Some(sums))).unwrap();
+        assert_eq!((handle.iterations_done(), handle.jobs()), (4, 9));
+    }
+
+    #[test]
+    fn jobs_fit_the_run_and_the_program() {
+        let alignment = parse(b"ACA\nACC\nGTA\nGTC\n").unwrap().alignment;
+        let shape = Shape::new(&alignment).unwrap();
+        for (iterations, expected) in [(0, 1), (1, 1), (64, 1), (1_000, 16), (1 << 20, 256)] {
+            assert_eq!(job_iterations(&shape, Mode::Reduce, iterations), expected, "{iterations}");
+        }
+        assert!(mi_graph(Arc::new(alignment), options(MAX_ITERATIONS + 1, None)).is_err());
+    }
+}

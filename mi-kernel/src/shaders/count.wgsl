@@ -1,0 +1,155 @@
+// Scores of pairs: a workgroup is one column i times 256 columns j, a lane owns four of them and a histogram of its own.
+// The rows come grouped by the symbol of column i, so the histogram is that of one symbol: no atomics, no barriers, and
+// no difference between conserved and random columns. Twin: src/reference.rs (score_pairs).
+
+// Two columns a word: n is below 65,536.
+var<workgroup> histogram: array<u32, SYMBOLS * 128u>;
+var<workgroup> group_maximum: atomic<u32>;
+
+fn count_row(symbols: u32, lane: u32) {
+    let a = (symbols & 0xffu) * 128u + lane;
+    histogram[a] += 1u;
+    let b = ((symbols >> 8u) & 0xffu) * 128u + lane;
+    histogram[b] += 0x10000u;
+    let c = ((symbols >> 16u) & 0xffu) * 128u + 64u + lane;
+    histogram[c] += 1u;
+    let d = (symbols >> 24u) * 128u + 64u + lane;
+    histogram[d] += 0x10000u;
+}
+
+fn grouped_row(base: u32, place: u32) -> u32 {
+    return (grouped[base + (place >> 1u)] >> ((place & 1u) * 16u)) & 0xffffu;
+}
+
+// Adds T over the histogram and empties it.
+fn flush(lane: u32) -> vec4<u32> {
+    var total = vec4<u32>();
+    for (var symbol = 0u; symbol < SYMBOLS; symbol += 1u) {
+        let at = symbol * 128u + lane;
+        let low = histogram[at];
+        let high = histogram[at + 64u];
+        histogram[at] = 0u;
+        histogram[at + 64u] = 0u;
+        total += vec4<u32>(table[low & 0xffffu], table[low >> 16u], table[high & 0xffffu], table[high >> 16u]);
+    }
+    return total;
+}
+
+// sum_ab T(c_ab) of column i with the four columns of a word.
+fn joint_terms(local_i: u32, word: u32, lane: u32) -> vec4<u32> {
+    let base = local_i * sizes.order_words;
+    let i = chunk.first_i + local_i;
+    var total = vec4<u32>();
+    for (var symbol = 0u; symbol < SYMBOLS; symbol += 1u) {
+        var place = bounds[i * (SYMBOLS + 1u) + symbol];
+        let end = bounds[i * (SYMBOLS + 1u) + symbol + 1u];
+        if place == end {
+            continue;
+        }
+        if (place & 1u) == 1u {
+            count_row(shuffled[grouped_row(base, place) * sizes.row_words + word], lane);
+            place += 1u;
+        }
+        // Four rows a round keep more loads in flight, and the rounds below lavapipe's 65,535.
+        while place + 4u <= end {
+            let rows_a = grouped[base + (place >> 1u)];
+            let rows_b = grouped[base + (place >> 1u) + 1u];
+            let symbols_0 = shuffled[(rows_a & 0xffffu) * sizes.row_words + word];
+            let symbols_1 = shuffled[(rows_a >> 16u) * sizes.row_words + word];
+            let symbols_2 = shuffled[(rows_b & 0xffffu) * sizes.row_words + word];
+            let symbols_3 = shuffled[(rows_b >> 16u) * sizes.row_words + word];
+            count_row(symbols_0, lane);
+            count_row(symbols_1, lane);
+            count_row(symbols_2, lane);
+            count_row(symbols_3, lane);
+            place += 4u;
+        }
+        while place < end {
+            count_row(shuffled[grouped_row(base, place) * sizes.row_words + word], lane);
+            place += 1u;
+        }
+        total += flush(lane);
+    }
+    return total;
+}
+
+// Which pairs a workgroup computes. z runs over column groups within a block of j, so that neighbours share a block.
+struct Work {
+    local_i: u32,
+    block: u32,
+    any: bool,
+}
+
+fn work_of(group: vec3<u32>) -> Work {
+    let z = group.z + first_z;
+    let local_i = (z % chunk.column_groups) * chunk.columns_x + group.x;
+    let block = chunk.first_block + z / chunk.column_groups;
+    // Blocks left of the diagonal hold no pair.
+    let last_j = block * BLOCK_COLUMNS + BLOCK_COLUMNS - 1u;
+    return Work(local_i, block, local_i < chunk.columns && last_j > chunk.first_i + local_i);
+}
+
+// X of column i with column j.
+fn score(joint: u32, i: u32, j: u32) -> i32 {
+    return bitcast<i32>(joint - column_terms[i] - column_terms[j] + table[sizes.n]);
+}
+
+// Place of the pair in the chunk.
+fn place_of(i: u32, j: u32) -> u32 {
+    return i * (2u * sizes.l - i - 1u) / 2u + j - i - 1u - chunk.first_place;
+}
+
+fn accumulate(at: u32, x: i32) {
+    let word = bitcast<u32>(x);
+    let sum = sums[at];
+    let sum_low = sum.x + word;
+    sums[at] = vec2<u32>(sum_low, sum.y + select(0u, 0xffffffffu, x < 0) + select(0u, 1u, sum_low < word));
+    let magnitude = select(word, 0u - word, x < 0);
+    let squared = product(magnitude, magnitude);
+    let square = squares[at];
+    let square_low = square.x + squared.low;
+    squares[at] = vec2<u32>(square_low, square.y + squared.high + select(0u, 1u, square_low < squared.low));
+    reached[at] += select(0u, 1u, x >= observed[at]);
+}
+
+@compute @workgroup_size(64, 1, 1)
+fn count_reduce(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocation_index) lane: u32) {
+    let work = work_of(group);
+    if !work.any {
+        return;
+    }
+    let i = chunk.first_i + work.local_i;
+    let word = work.block * LANES + lane;
+    let joint = joint_terms(work.local_i, min(word, sizes.row_words - 1u), lane);
+    var largest = 0u;
+    for (var column = 0u; column < 4u; column += 1u) {
+        let j = word * 4u + column;
+        if j > i && j < sizes.l {
+            let x = score(joint[column], i, j);
+            accumulate(place_of(i, j), x);
+            largest = max(largest, bitcast<u32>(x) ^ 0x80000000u);
+        }
+    }
+    atomicMax(&group_maximum, largest);
+    workgroupBarrier();
+    if lane == 0u {
+        atomicMax(&maxima[round_keys[0]], atomicLoad(&group_maximum));
+    }
+}
+
+@compute @workgroup_size(64, 1, 1)
+fn count_matrix(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocation_index) lane: u32) {
+    let work = work_of(group);
+    if !work.any {
+        return;
+    }
+    let i = chunk.first_i + work.local_i;
+    let word = work.block * LANES + lane;
+    let joint = joint_terms(work.local_i, min(word, sizes.row_words - 1u), lane);
+    for (var column = 0u; column < 4u; column += 1u) {
+        let j = word * 4u + column;
+        if j > i && j < sizes.l {
+            scores[place_of(i, j)] = score(joint[column], i, j);
+        }
+    }
+}
