@@ -140,7 +140,7 @@ pub fn heat_map(l: usize, matrix: &[f64]) -> Result<Vec<u8>, ImageError> {
     sorted.sort_by(f64::total_cmp);
     #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a place in the list")]
     let place = (sorted.len() as f64 * CLIP_SHARE) as usize;
-    let brightest = sorted.get(place).or(sorted.last()).copied().unwrap_or(0.0);
+    let brightest = sorted.get(place).or_else(|| sorted.last()).copied().unwrap_or(0.0);
     let scale = if brightest > 0.0 { 1.0 / brightest } else { 0.0 };
     let bytes: Vec<u8> = pixels.iter().flat_map(|value| colour(value * scale)).collect();
     let edge = u32::try_from(edge).expect("a picture's edge is bounded");

@@ -144,7 +144,7 @@ async fn finish(
         observed,
         sums: handle.sums(),
         folder: arguments.folder.clone(),
-        top: arguments.top.unwrap_or(input.alignment.l() * 5),
+        top: arguments.top.unwrap_or_else(|| input.alignment.l() * 5),
     };
     let record = json!({
         "input": shown(&arguments.alignment),
@@ -237,7 +237,7 @@ impl Results {
         place(&self.folder, "run.json", |out| out.write_all(text.as_bytes()))?;
         let sums = saved::save(&self.alignment, self.seed, &self.sums);
         place(&self.folder, SUMS, |out| out.write_all(&sums))?;
-        let best = pairs.iter().max_by(|a, b| a.z.total_cmp(&b.z));
+        let best = pairs.iter().max_by(|a, b| a.z.total_cmp(&b.z).then(a.mi_bits.total_cmp(&b.mi_bits)));
         Ok(best.map_or_else(String::new, |best| {
             format!("highest Z {:.1}: columns {} and {}", best.z, best.i + 1, best.j + 1)
         }))

@@ -1,0 +1,198 @@
+//! Times iterations of the null model on one device, without a farm: a random alignment of given sizes.
+//!
+//! `cargo run --release -p mi-kernel --example throughput -- [N L Q [ITERATIONS]] [--conserved] [--unchecked]`
+//!
+//! Without sizes the three sets of the thesis with 21 symbols (45,000 x 1,400; 4,176 x 5,025; 20,000 x 2,189). Prints
+//! one line of JSON a set. The time is the device's, of jobs after a warm-up. `--conserved` gives each column one symbol
+//! in nine of ten places.
+
+use std::{
+    env,
+    error::Error,
+    sync::{Arc, mpsc},
+    time::{Duration, Instant},
+};
+
+use bytes::Bytes;
+use farm_core::{
+    id::{AppId, Attempt, ContentHash, Epoch, JobAttempt, JobId, JobIndex, TaskId},
+    program::{Content, JobProgram},
+};
+use gpu_exec::{DeviceSpec, Executor, ExecutorConfig, ExecutorEvent, Order, expand};
+use mi_kernel::{
+    Alignment, Reference, Seed,
+    gpu::{AlignmentContents, MiJob, PackedAlignment, Pass, Shape, module_source},
+    parse,
+};
+
+/// N, L and q of the thesis' sets (5.5.1).
+const THESIS: [[usize; 3]; 3] = [[45_000, 1_400, 21], [4_176, 5_025, 21], [20_000, 2_189, 21]];
+const SYMBOLS: &[u8] = b"-ACDEFGHIKLMNPQRSTVWYBZXUOJ";
+const LIMIT: Duration = Duration::from_secs(600);
+
+struct Arguments {
+    sets: Vec<[usize; 3]>,
+    iterations: u64,
+    conserved: bool,
+    unchecked: bool,
+}
+
+fn arguments() -> Result<Arguments, Box<dyn Error>> {
+    let (mut numbers, mut conserved, mut unchecked) = (Vec::new(), false, false);
+    for argument in env::args().skip(1) {
+        match argument.as_str() {
+            "--conserved" => conserved = true,
+            "--unchecked" => unchecked = true,
+            number => numbers.push(number.parse::<usize>().map_err(|error| format!("{number}: {error}"))?),
+        }
+    }
+    let (sets, iterations) = match numbers[..] {
+        [] => (THESIS.to_vec(), 10),
+        [n, l, q] => (vec![[n, l, q]], 10),
+        [n, l, q, iterations] => (vec![[n, l, q]], iterations as u64),
+        _ => return Err("expected N L Q [ITERATIONS]".into()),
+    };
+    if sets.iter().any(|[_, _, q]| !(1..=SYMBOLS.len()).contains(q)) {
+        return Err(format!("Q must be 1 to {}", SYMBOLS.len()).into());
+    }
+    Ok(Arguments { sets, iterations, conserved, unchecked })
+}
+
+/// Random residues; the same sizes always give the same.
+fn generate([n, l, q]: [usize; 3], conserved: bool) -> Result<Alignment, Box<dyn Error>> {
+    let mut state = 1_u64;
+    let mut draw = || {
+        state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        usize::try_from(state >> 33)
+    };
+    let mut text = Vec::with_capacity(n * (l + 1));
+    for _ in 0..n {
+        for column in 0..l {
+            let value = draw()?;
+            let code = if conserved && value % 10 != 0 { column } else { value / 10 };
+            text.push(SYMBOLS[code % q]);
+        }
+        text.push(b'\n');
+    }
+    Ok(parse(&text)?.alignment)
+}
+
+struct Bench {
+    executor: Executor,
+    inbox: mpsc::Receiver<ExecutorEvent>,
+    sequence: u64,
+}
+
+impl Bench {
+    /// Device time and sections of a job.
+    fn run(
+        &mut self,
+        program: JobProgram,
+        contents: &[(ContentHash, Bytes)],
+    ) -> Result<(Duration, Vec<Bytes>), Box<dyn Error>> {
+        self.sequence += 1;
+        let job = JobAttempt {
+            job: JobId { app: AppId(1), task: TaskId(0), index: JobIndex(0) },
+            attempt: Attempt { epoch: Epoch(1), sequence: self.sequence },
+        };
+        let order = Order { job, program: Arc::new(program), contents: contents.to_vec(), limit: LIMIT };
+        self.executor.submit(order)?;
+        loop {
+            match self.inbox.recv_timeout(LIMIT)? {
+                ExecutorEvent::Started { .. } => {}
+                ExecutorEvent::Finished { outcome, device_time_ns, .. } => {
+                    let sections = outcome.map_err(|failure| format!("{failure:?}"))?;
+                    return Ok((Duration::from_nanos(device_time_ns), sections));
+                }
+                ExecutorEvent::Lost { reason } => return Err(reason.into()),
+            }
+        }
+    }
+}
+
+fn measure(bench: &mut Bench, arguments: &Arguments, set: [usize; 3]) -> Result<(), Box<dyn Error>> {
+    let alignment = generate(set, arguments.conserved)?;
+    let shape = Shape::new(&alignment)?;
+    let reference = Reference::unscored(&alignment)?;
+    let packed = PackedAlignment::new(&reference, &shape);
+    let mut contents = Vec::new();
+    let mut name = |bytes: Vec<u8>| {
+        let hash = ContentHash(*blake3::hash(&bytes).as_bytes());
+        let content = Content { hash, size_bytes: bytes.len() as u64 };
+        contents.push((hash, Bytes::from(bytes)));
+        content
+    };
+    let named = AlignmentContents {
+        codes: name(packed.codes),
+        orders: packed.orders.into_iter().map(&mut name).collect(),
+        bounds: name(packed.bounds),
+        table: name(packed.table),
+        column_terms: name(packed.column_terms),
+        module: name(module_source(shape.symbols()).into_bytes()),
+    };
+    let started = Instant::now();
+    let pass = MiJob { seed: Seed(1), pass: Pass::Observed };
+    let mut program = JobProgram::default();
+    pass.program(&shape, &named, &[], &mut program)?;
+    let (observed_time, sections) = bench.run(program, &contents)?;
+    let observed = pass.scores(&shape, &sections)?.remove(0);
+    let mut digest = blake3::Hasher::new();
+    let mut extra = Vec::new();
+    let observed_names: Vec<Content> = shape
+        .observed_bytes(&observed)
+        .into_iter()
+        .map(|bytes| {
+            let hash = ContentHash(*blake3::hash(&bytes).as_bytes());
+            let content = Content { hash, size_bytes: bytes.len() as u64 };
+            extra.push((hash, Bytes::from(bytes)));
+            content
+        })
+        .collect();
+    contents.extend(extra);
+    let mut job = |range: std::ops::Range<u64>| -> Result<(Duration, Vec<Bytes>), Box<dyn Error>> {
+        let pass = MiJob { seed: Seed(1), pass: Pass::Reduce(range) };
+        let mut program = JobProgram::default();
+        pass.program(&shape, &named, &observed_names, &mut program)?;
+        bench.run(program, &contents)
+    };
+    // Compiles, and finds the device's pace.
+    let _ = job(0..1)?;
+    let _ = job(0..1)?;
+    let warm_up = started.elapsed();
+    let began = Instant::now();
+    let (device_time, sections) = job(0..arguments.iterations)?;
+    let wall = began.elapsed();
+    for section in &sections {
+        digest.update(section);
+    }
+    let per_iteration_ms = device_time.as_secs_f64() * 1e3 / arguments.iterations as f64;
+    let counts = shape.pairs() as f64 * alignment.n() as f64;
+    println!(
+        "{{\"device\":\"{}\",\"n\":{},\"l\":{},\"q\":{},\"conserved\":{},\"iterations\":{},\"ms_per_iteration\":{:.3},\
+         \"wall_ms_per_iteration\":{:.3},\"counts_per_ns\":{:.2},\"observed_ms\":{:.1},\"warm_up_s\":{:.2},\
+         \"blake3\":\"{}\"}}",
+        bench.executor.info().name,
+        alignment.n(),
+        alignment.l(),
+        alignment.q(),
+        arguments.conserved,
+        arguments.iterations,
+        per_iteration_ms,
+        wall.as_secs_f64() * 1e3 / arguments.iterations as f64,
+        counts / (per_iteration_ms * 1e6),
+        observed_time.as_secs_f64() * 1e3,
+        warm_up.as_secs_f64(),
+        digest.finalize().to_hex(),
+    );
+    Ok(())
+}
+
+fn main() -> Result<(), Box<dyn Error>> {
+    let arguments = arguments()?;
+    let (events, inbox) = mpsc::channel();
+    let config = ExecutorConfig { unchecked: arguments.unchecked, ..ExecutorConfig::default() };
+    let device = expand(&[DeviceSpec::All])?;
+    let executor = Executor::start(&device[0], config, move |event| drop(events.send(event)))?;
+    let mut bench = Bench { executor, inbox, sequence: 0 };
+    arguments.sets.iter().try_for_each(|set| measure(&mut bench, &arguments, *set))
+}
