@@ -13,6 +13,9 @@ pub struct FarmOptions {
     pub name: String,
     /// Fair-share weight, > 0 and finite.
     pub weight: f64,
+    /// Whether queued jobs may be moved between nodes to balance them. Costs a little traffic, and is worth it
+    /// whenever devices or jobs are unequal.
+    pub global_stealing: bool,
     /// How long connecting and registering may take.
     pub connect_timeout: Duration,
     /// How long a lost coordinator is tried again before the run ends.
@@ -42,12 +45,13 @@ impl Default for Window {
 }
 
 impl FarmOptions {
-    /// Default settings: weight 1, 5 s to connect, 30 s to reconnect, 60 s of patience.
+    /// Default settings: weight 1, no stealing between nodes, 5 s to connect, 30 s to reconnect, 60 s of patience.
     pub fn new(coordinator: impl Into<String>, name: impl Into<String>) -> Self {
         Self {
             coordinator: coordinator.into(),
             name: name.into(),
             weight: 1.0,
+            global_stealing: false,
             connect_timeout: Duration::from_secs(5),
             reconnect_timeout: Duration::from_secs(30),
             patience: Duration::from_secs(60),

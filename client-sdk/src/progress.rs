@@ -11,7 +11,7 @@ pub struct Progress {
     pub jobs_done: u64,
     /// Jobs that the tasks have made so far; grows while tasks make more.
     pub jobs_known: u64,
-    /// New attempts after losses.
+    /// New attempts after losses and steals.
     pub replanned: u64,
     /// Measured device time of the jobs done.
     pub device_time: Duration,
@@ -40,7 +40,7 @@ pub enum CoordinatorLink {
 pub struct RunSummary {
     /// Jobs retrieved.
     pub jobs: u64,
-    /// New attempts after losses (of this connection while the run went).
+    /// New attempts after losses and steals (of this connection while the run went).
     pub replanned: u64,
     /// Measured device time of the jobs.
     pub device_time: Duration,

@@ -456,3 +456,47 @@ async fn a_dropped_run_and_a_closed_farm_leave_nothing_behind() {
     assert!(status.apps.is_empty(), "goodbye was said: {:?}", status.apps);
     farm.stop().await;
 }
+
+/// Jobs executed by each node, in order of registration.
+async fn executed(farm: &TestFarm) -> Vec<u64> {
+    let status = farm.coordinator.status().await.unwrap();
+    status.nodes.iter().map(|node| node.devices.iter().map(|device| device.executed_jobs).sum()).collect()
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn stealing_between_nodes_mends_a_wrong_score() {
+    let mut farm = TestFarm::start(1, &["sim:score=9000"]).await;
+    farm.add_worker(&["sim:score=1000"], |options| options).await;
+    let app = Farm::connect(FarmOptions { global_stealing: true, ..farm.options() }).await.unwrap();
+    let brought = Brought::default();
+    let cost = CostNs(10_000_000);
+    let task =
+        Echoes { jobs: 200, cost, module: module(), brought: Arc::clone(&brought), ..Echoes::default() };
+    assert_eq!(app.run(TaskGraph::new().task("echo", task)).await.unwrap().jobs, 200);
+    let brought = brought.lock().unwrap().clone();
+    assert_eq!(brought.len(), 200, "none twice");
+    assert_eq!(brought.into_iter().collect::<BTreeSet<_>>(), (0..200).collect(), "none missing");
+    // By the scores the second one gets 20 jobs; it is as fast as the first.
+    let executed = executed(&farm).await;
+    assert!(executed[1] > 30, "executed: {executed:?}");
+    app.close().await;
+    farm.stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_node_that_joins_takes_over_queued_jobs() {
+    let mut farm = TestFarm::start(1, &["sim"]).await;
+    let app = farm.connect().await;
+    let mut progress = app.progress();
+    let task = Echoes { jobs: 300, cost: CostNs(10_000_000), module: module(), ..Echoes::default() };
+    let join = async {
+        progress.wait_for(|progress| progress.jobs_done >= 5).await.unwrap();
+        farm.add_worker(&["sim"], |options| options).await;
+    };
+    let (outcome, ()) = tokio::join!(app.run(TaskGraph::new().task("echo", task)), join);
+    assert_eq!(outcome.unwrap().jobs, 300);
+    let executed = executed(&farm).await;
+    assert!(executed[1] > 0, "executed: {executed:?}");
+    app.close().await;
+    farm.stop().await;
+}

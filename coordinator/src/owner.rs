@@ -225,8 +225,13 @@ mod tests {
         let open = |link, capacity| {
             let (outbound, outgoing) = mpsc::channel(capacity);
             let (alive, ended) = oneshot::channel();
-            let hello =
-                AppHello { protocol: PROTOCOL_VERSION, name: "app".to_owned(), weight: 1.0, resume: None };
+            let hello = AppHello {
+                protocol: PROTOCOL_VERSION,
+                name: "app".to_owned(),
+                weight: 1.0,
+                global_stealing: false,
+                resume: None,
+            };
             let said = [
                 Command::AppOpened(link, Peer { outbound, _alive: alive }),
                 Command::FromApp(link, AppToCoordinator::Hello(hello)),

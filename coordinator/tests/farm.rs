@@ -31,7 +31,8 @@ async fn farm() -> (CoordinatorHandle, String) {
 
 async fn app(address: &str, protocol: u32) -> AppSession {
     let session = control::connect_app(address).await.unwrap();
-    let hello = AppHello { protocol, name: "an app".to_owned(), weight: 1.0, resume: None };
+    let hello =
+        AppHello { protocol, name: "an app".to_owned(), weight: 1.0, global_stealing: false, resume: None };
     session.sender.try_send(AppToCoordinator::Hello(hello)).unwrap();
     session
 }
@@ -158,7 +159,13 @@ async fn a_malformed_message_ends_the_session_by_field() {
     let (_handle, address) = farm().await;
     let channel = tonic::transport::Endpoint::from_shared(format!("http://{address}")).unwrap();
     let mut client = v1::apps_client::AppsClient::new(channel.connect().await.unwrap());
-    let hello = v1::AppHello { protocol: PROTOCOL_VERSION, name: "a".to_owned(), weight: -1.0, resume: None };
+    let hello = v1::AppHello {
+        protocol: PROTOCOL_VERSION,
+        name: "a".to_owned(),
+        weight: -1.0,
+        global_stealing: false,
+        resume: None,
+    };
     let hello = v1::AppToCoordinator { message: Some(v1::app_to_coordinator::Message::Hello(hello)) };
     let outgoing = tokio_stream::once(hello).chain(tokio_stream::pending());
     let mut answers = client.session(outgoing).await.unwrap().into_inner();

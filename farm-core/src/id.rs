@@ -75,6 +75,10 @@ id!(
     BatchId(u64), "batch-"
 );
 id!(
+    /// One try of the coordinator to move queued jobs from a node to another; never reused inside one epoch.
+    StealId(u64), "steal-"
+);
+id!(
     /// A driver's handle of one connection; means nothing outside the process that drew it.
     LinkId(u64), "link-"
 );

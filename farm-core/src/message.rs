@@ -7,7 +7,7 @@ use crate::{
     device::{DeviceInfo, Requirements},
     id::{
         AppId, AppIncarnation, BatchId, ContentHash, DeviceIndex, Epoch, JobAttempt, JobId, JobIndex, NodeId,
-        NodeSession, TaskId,
+        NodeSession, StealId, TaskId,
     },
     program::Content,
 };
@@ -63,6 +63,9 @@ pub struct AppHello {
     pub name: String,
     /// Fair-share weight, > 0 and finite.
     pub weight: f64,
+    /// Whether queued jobs may be moved between nodes to balance them (thesis 5.6.3). When a node joins they may be
+    /// moved to it in any case.
+    pub global_stealing: bool,
     /// Who the application was before its connection broke, if it comes back.
     pub resume: Option<(AppId, AppIncarnation)>,
 }
@@ -306,6 +309,17 @@ pub enum NodeToCoordinator {
         /// Why, for people.
         reason: String,
     },
+    /// Answer to [`CoordinatorToNode::Retract`]: each of its attempts is in one of the three lists.
+    Retracted {
+        /// Of the order answered.
+        steal: StealId,
+        /// Will never run here: a new attempt may be issued.
+        retracted: Vec<JobAttempt>,
+        /// Run or ran here, and stay.
+        running: Vec<JobAttempt>,
+        /// Ended here, or another attempt is here: the reports say what became of them.
+        unknown: Vec<JobAttempt>,
+    },
     /// A drained node leaves: it holds no job any more.
     Goodbye,
 }
@@ -341,6 +355,13 @@ pub enum CoordinatorToNode {
     },
     /// Forget these attempts; stop them at the next launch boundary if they run.
     Cancel {
+        /// Which.
+        jobs: Vec<JobAttempt>,
+    },
+    /// Give these attempts up unless they run; answer with [`NodeToCoordinator::Retracted`].
+    Retract {
+        /// Repeated in the answer.
+        steal: StealId,
         /// Which.
         jobs: Vec<JobAttempt>,
     },

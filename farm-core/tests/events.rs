@@ -7,7 +7,7 @@ use farm_core::{
     device::{DeviceInfo, DeviceKind, Features, Limits, Requirements},
     id::{
         AppId, AppIncarnation, Attempt, BatchId, ContentHash, DeviceIndex, Epoch, JobAttempt, JobId,
-        JobIndex, LinkId, NodeId, NodeSession, TaskId,
+        JobIndex, LinkId, NodeId, NodeSession, StealId, TaskId,
     },
     ledger::{self, Ledger, SubmittedJob},
     message::{
@@ -85,6 +85,7 @@ fn app_hello(step: Step) -> AppHello {
         protocol: PROTOCOL_VERSION + u32::from(step.four == 5),
         name: "app".to_owned(),
         weight: f64::from(step.three),
+        global_stealing: step.three != 1,
         resume: (step.two > 1).then(|| (AppId(step.two.into()), AppIncarnation(u32::from(step.four)))),
     }
 }
@@ -149,6 +150,14 @@ fn coordinator_event(step: Step) -> coordinator::Event {
         11 => from_node(NodeToCoordinator::DeviceLost {
             device: DeviceIndex(step.two.into()),
             reason: "test".to_owned(),
+        }),
+        17 => from_node(NodeToCoordinator::Retracted {
+            steal: StealId(u64::from(step.three) + 1),
+            retracted: (0..12)
+                .map(|sequence| attempt(step.two, sequence, sequence * (step.four + 1)))
+                .collect(),
+            running: Vec::new(),
+            unknown: Vec::new(),
         }),
         13 if step.four == 0 => from_node(NodeToCoordinator::Goodbye),
         15 => coordinator::Event::DrainRequested { node: NodeId(step.two.into()) },
@@ -225,6 +234,10 @@ fn worker_event(step: Step) -> worker::Event {
             worker::Event::FromCoordinator(CoordinatorToNode::AppLeft { app: AppId(u64::from(step.one) % 2) })
         }
         23 => worker::Event::FromCoordinator(CoordinatorToNode::Cancel { jobs: vec![job(step)] }),
+        26 => worker::Event::FromCoordinator(CoordinatorToNode::Retract {
+            steal: StealId(step.one.into()),
+            jobs: (0..=step.three).map(|index| attempt(step.one % 2, index + step.two, step.four)).collect(),
+        }),
         24 => worker::Event::FromCoordinator(CoordinatorToNode::HeartbeatAck { sequence: step.four.into() }),
         25 if step.three == 0 && step.four == 0 => worker::Event::DrainRequested,
         _ => worker::Event::CoordinatorConnected,
@@ -435,7 +448,7 @@ proptest! {
     #[test]
     fn the_ledger_keeps_its_invariants(steps in steps(25)) {
         let hello =
-            AppHello { protocol: PROTOCOL_VERSION, name: "app".to_owned(), weight: 1.0, resume: None };
+            AppHello { protocol: PROTOCOL_VERSION, name: "app".to_owned(), weight: 1.0, global_stealing: false, resume: None };
         let mut ledger = Ledger::new(hello);
         let mut ends = BTreeMap::new();
         let mut now = Instant::ZERO;

@@ -43,7 +43,13 @@ fn farm() -> CoordinatorMachine {
             Event::FromNode { link: LinkId(node), message: NodeToCoordinator::Hello(hello) },
         );
     }
-    let hello = AppHello { protocol: PROTOCOL_VERSION, name: "app".to_owned(), weight: 1.0, resume: None };
+    let hello = AppHello {
+        protocol: PROTOCOL_VERSION,
+        name: "app".to_owned(),
+        weight: 1.0,
+        global_stealing: false,
+        resume: None,
+    };
     machine.handle(Instant::ZERO, Event::FromApp { link: APP, message: AppToCoordinator::Hello(hello) });
     machine
 }

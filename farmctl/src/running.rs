@@ -9,7 +9,7 @@ use crate::{
     progress::{self, Units},
 };
 
-/// Runs the graph on a farm; the first signal stops it in order, the second one ends the process.
+/// Runs the graph on a farm, with stealing between its nodes; the first signal stops it in order, the second one ends the process.
 pub(crate) async fn run_graph(
     options: FarmOptions,
     graph: TaskGraph,
@@ -17,7 +17,7 @@ pub(crate) async fn run_graph(
     units: Units,
     stops: &mut Stops,
 ) -> Result<RunSummary, FarmError> {
-    let farm = Farm::connect(options).await?;
+    let farm = Farm::connect(FarmOptions { global_stealing: true, ..options }).await?;
     let teller = tokio::spawn(progress::tell(farm.progress(), style, units));
     let stop = farm.stop_handle();
     let result = {

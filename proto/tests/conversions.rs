@@ -9,7 +9,7 @@ use farm_core::{
     device::{DeviceInfo, DeviceKind, Features, Limits, Requirements, SimulatedDevices},
     id::{
         AppId, AppIncarnation, Attempt, BatchId, ContentHash, DeviceIndex, Epoch, JobAttempt, JobId,
-        JobIndex, NodeId, NodeSession, TaskId,
+        JobIndex, NodeId, NodeSession, StealId, TaskId,
     },
     message::{
         AppHello, AppToCoordinator, Contact, CoordinatorToApp, CoordinatorToNode, CostNs, DeviceLoad,
@@ -122,10 +122,10 @@ fn failure() -> impl Strategy<Value = JobFailure> {
 }
 
 fn app_to_coordinator() -> impl Strategy<Value = AppToCoordinator> {
-    let hello = (any::<u32>(), "\\PC{0,40}", positive(), option::of(any::<(u64, u32)>())).prop_map(
-        |(protocol, name, weight, resume)| {
+    let hello = (any::<(u32, bool)>(), "\\PC{0,40}", positive(), option::of(any::<(u64, u32)>())).prop_map(
+        |((protocol, global_stealing), name, weight, resume)| {
             let resume = resume.map(|(app, life)| (AppId(app), AppIncarnation(life)));
-            AppToCoordinator::Hello(AppHello { protocol, name, weight, resume })
+            AppToCoordinator::Hello(AppHello { protocol, name, weight, global_stealing, resume })
         },
     );
     let job = |cost: BoxedStrategy<u64>| {
@@ -225,6 +225,14 @@ fn node_to_coordinator() -> impl Strategy<Value = NodeToCoordinator> {
             device: DeviceIndex(device),
             reason
         }),
+        (any::<u64>(), attempts(), attempts(), attempts()).prop_map(
+            |(steal, retracted, running, unknown)| NodeToCoordinator::Retracted {
+                steal: StealId(steal),
+                retracted,
+                running,
+                unknown
+            }
+        ),
         Just(NodeToCoordinator::Goodbye),
     ]
 }
@@ -241,6 +249,8 @@ fn coordinator_to_node() -> impl Strategy<Value = CoordinatorToNode> {
             .prop_map(|(app, weight)| CoordinatorToNode::AppJoined { app: AppId(app), weight }),
         any::<u64>().prop_map(|app| CoordinatorToNode::AppLeft { app: AppId(app) }),
         attempts().prop_map(|jobs| CoordinatorToNode::Cancel { jobs }),
+        (any::<u64>(), attempts())
+            .prop_map(|(steal, jobs)| CoordinatorToNode::Retract { steal: StealId(steal), jobs }),
         Just(CoordinatorToNode::Drain),
         any::<u64>().prop_map(|sequence| CoordinatorToNode::HeartbeatAck { sequence }),
     ]
@@ -363,7 +373,8 @@ fn report(change: impl FnOnce(&mut v1::Report)) -> Result<NodeToCoordinator, Wir
 #[test]
 fn what_is_not_allowed_is_refused_by_field() {
     let hello = |weight: f64, name: &str| {
-        let hello = v1::AppHello { protocol: 1, name: name.to_owned(), weight, resume: None };
+        let hello =
+            v1::AppHello { protocol: 1, name: name.to_owned(), weight, resume: None, global_stealing: false };
         AppHello::try_from(hello).map(|_| ())
     };
     let plan = |index_deltas: Vec<i64>, cost_ns: Vec<u64>| {

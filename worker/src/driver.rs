@@ -4,7 +4,7 @@
 use std::{
     collections::{HashMap, HashSet},
     sync::Arc,
-    time::Instant,
+    time::{Duration, Instant},
 };
 
 use bytes::Bytes;
@@ -39,6 +39,8 @@ use crate::{
 pub(crate) const QUEUED_INPUTS: usize = 1_024;
 /// Inputs taken in before effects are carried out.
 const INPUTS_PER_TURN: usize = 128;
+/// How long a leaving node waits for the coordinator to hear its goodbye.
+const GOODBYE_WAIT: Duration = Duration::from_secs(1);
 /// Device events taken in while effects are carried out.
 const ANSWERS_PER_TURN: usize = 256;
 
@@ -145,12 +147,30 @@ pub(crate) async fn drive(setup: Setup) -> End {
         }
         driver.act_on_timers();
     };
-    driver.coordinator = None;
+    let connected = driver.coordinator.take().is_some();
+    if connected && matches!(end, End::Drained) {
+        goodbye_heard(driver.serial, &mut received).await;
+    }
     for (_, outbox) in driver.links.drain() {
         outbox.close("the node leaves");
     }
     server.shutdown("the node leaves").await;
     end
+}
+
+/// Waits until the coordinator has heard the goodbye: it closes the session then. A process that ended before would
+/// take the goodbye along.
+async fn goodbye_heard(serial: u64, received: &mut mpsc::Receiver<Input>) {
+    let ended = async {
+        while let Some(input) = received.recv().await {
+            if matches!(input, Input::CoordinatorEnded { serial: ended, .. } if ended == serial) {
+                break;
+            }
+        }
+    };
+    if tokio::time::timeout(GOODBYE_WAIT, ended).await.is_err() {
+        tracing::warn!("the coordinator did not answer the goodbye");
+    }
 }
 
 impl Driver {
@@ -223,6 +243,7 @@ impl Driver {
             CoordinatorToNode::AppJoined { .. }
             | CoordinatorToNode::AppLeft { .. }
             | CoordinatorToNode::Cancel { .. }
+            | CoordinatorToNode::Retract { .. }
             | CoordinatorToNode::Drain
             | CoordinatorToNode::HeartbeatAck { .. } => {}
         }

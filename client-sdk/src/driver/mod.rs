@@ -182,6 +182,7 @@ pub(crate) async fn drive(setup: DriverSetup) {
         protocol: farm_core::message::PROTOCOL_VERSION,
         name: options.name.clone(),
         weight: options.weight,
+        global_stealing: options.global_stealing,
         resume: None,
     };
     let links = Links::new(handle.inputs.clone(), contents, options.window.result_bytes);

@@ -5,6 +5,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use super::{
     CoordinatorMachine,
     model::{JobState, Peer},
+    steal::MAX_STEALS,
 };
 use crate::id::{AppId, DeviceIndex, JobKey};
 
@@ -19,6 +20,7 @@ impl CoordinatorMachine {
         self.check_jobs();
         self.check_books();
         self.check_queue();
+        self.check_steals();
     }
 
     fn check_links(&self) {
@@ -83,6 +85,34 @@ impl CoordinatorMachine {
                 assert_eq!(booked, expected, "load of {id} {}", DeviceIndex(index));
             }
             assert!(loads.is_empty(), "{id} holds jobs of devices it does not have");
+        }
+    }
+
+    /// I9: at most one order per thief, each job in one order at most and stolen at most three times.
+    fn check_steals(&self) {
+        let mut thieves = BTreeSet::new();
+        for (id, steal) in &self.steals {
+            assert!(thieves.insert(steal.thief), "I9: {} has two steals at once", steal.thief);
+            assert_ne!(steal.thief, steal.victim, "I9: {id} is from a node to itself");
+            assert!(
+                self.nodes.contains_key(&steal.victim),
+                "I8: {id} waits for {}, which left",
+                steal.victim
+            );
+            let timed = self.wake.is_some_and(|wake| wake <= steal.answer_by);
+            assert!(timed, "I1: {id} waits without a timer");
+        }
+        for (id, app) in &self.apps {
+            for (key, job) in &app.jobs {
+                assert!(job.stolen_from.len() <= MAX_STEALS, "I9: {id} {key} was stolen too often");
+                let JobState::Placed(place) = job.state else { continue };
+                let Some(steal) = place.retracting else { continue };
+                let order = self.steals.get(&steal);
+                let named = order.is_some_and(|order| {
+                    order.victim == place.node && order.jobs.get(&key.in_app(*id)) == Some(&place.attempt)
+                });
+                assert!(named, "I9: {id} {key} waits for {steal}, which does not name it");
+            }
         }
     }
 

@@ -49,6 +49,7 @@ impl CoordinatorMachine {
     pub(super) fn expire(&mut self, now: Instant) {
         self.expire_nodes(now);
         self.expire_apps(now);
+        self.expire_steals(now);
     }
 
     /// Finds the next deadline.
@@ -65,7 +66,8 @@ impl CoordinatorMachine {
             };
             [Some(lease), app.unreachable.values().min().copied()]
         });
-        self.wake = nodes.chain(apps).flatten().min();
+        let steals = self.steals.values().map(|steal| Some(steal.answer_by));
+        self.wake = nodes.chain(apps).chain(steals).flatten().min();
     }
 
     fn expire_nodes(&mut self, now: Instant) {

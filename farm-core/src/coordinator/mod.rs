@@ -4,7 +4,8 @@
 //! ([`LinkId`]) and carries the effects out.
 //!
 //! Split by event family: `registry` (who is there), `placement` (where jobs go), `report` (what ended), `replan` (what
-//! was lost), `lease` (who is silent), `status` (what operators see). `model` holds the state they share.
+//! was lost), `steal` (what moves between nodes), `lease` (who is silent), `status` (what operators see). `model` holds
+//! the state they share.
 
 mod invariants;
 mod lease;
@@ -14,15 +15,19 @@ mod registry;
 mod replan;
 mod report;
 mod status;
+mod steal;
 
 use std::collections::{BTreeMap, VecDeque};
 
 use serde::{Deserialize, Serialize};
 
-use self::model::{App, Calibration, Node, Peer, Pending};
+use self::{
+    model::{App, Calibration, Node, Peer, Pending},
+    steal::Steal,
+};
 use crate::{
     device::DeviceKind,
-    id::{AppId, BatchId, DeviceIndex, Epoch, JobKey, LinkId, NodeId},
+    id::{AppId, BatchId, DeviceIndex, Epoch, JobKey, LinkId, NodeId, StealId},
     message::{AppToCoordinator, CoordinatorToApp, CoordinatorToNode, Liveness, NodeToCoordinator},
     time::Instant,
 };
@@ -207,10 +212,14 @@ pub struct CoordinatorMachine {
     stuck: VecDeque<Pending>,
     /// Jobs that lost their place during the current event.
     lost: BTreeMap<(AppId, BatchId), Vec<JobKey>>,
+    /// Retract orders without an answer; at most one for each thief.
+    steals: BTreeMap<StealId, Steal>,
+    next_steal: u64,
     /// No later than the earliest deadline.
     wake: Option<Instant>,
     delivered_jobs: u64,
     replanned_jobs: u64,
+    stolen_jobs: u64,
     effects: VecDeque<Effect>,
 }
 
@@ -231,22 +240,41 @@ impl CoordinatorMachine {
             fresh: VecDeque::new(),
             stuck: VecDeque::new(),
             lost: BTreeMap::new(),
+            steals: BTreeMap::new(),
+            next_steal: 1,
             wake: None,
             delivered_jobs: 0,
             replanned_jobs: 0,
+            stolen_jobs: 0,
             effects: VecDeque::new(),
         }
     }
 
     /// Takes one event in.
     pub fn handle(&mut self, now: Instant, event: Event) {
-        match event {
-            Event::FromApp { link, message } => self.app_said(now, link, message),
-            Event::FromNode { link, message } => self.node_said(now, link, message),
-            Event::LinkClosed { link } => self.link_closed(now, link),
-            Event::DrainRequested { node } => self.drain(node),
-        }
+        let speaker = match event {
+            Event::FromApp { link, message } => {
+                self.app_said(now, link, message);
+                None
+            }
+            Event::FromNode { link, message } => {
+                self.node_said(now, link, message);
+                self.links.get(&link).copied()
+            }
+            Event::LinkClosed { link } => {
+                self.link_closed(now, link);
+                None
+            }
+            Event::DrainRequested { node } => {
+                self.drain(node);
+                None
+            }
+        };
         self.place_pending(now);
+        match speaker {
+            Some(Peer::Node(node)) => self.consider_stealing(now, node),
+            Some(Peer::App(_)) | None => {}
+        }
     }
 
     /// Acts on the timers that are due.
@@ -310,6 +338,10 @@ impl CoordinatorMachine {
                 self.reported(now, node, executed, &delivered)
             }
             NodeToCoordinator::DeviceLost { device, reason } => self.device_lost(node, device, &reason),
+            NodeToCoordinator::Retracted { steal, retracted, running, unknown } => {
+                tracing::debug!(%steal, %node, kept = running.len(), unknown = unknown.len(), "retracted");
+                self.retracted(now, node, steal, &retracted);
+            }
             NodeToCoordinator::Goodbye => {
                 self.close(link);
                 self.node_leaves(now, node);

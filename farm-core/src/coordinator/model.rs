@@ -6,7 +6,10 @@ use std::collections::{BTreeMap, BTreeSet};
 use super::NodeState;
 use crate::{
     device::{DeviceInfo, Requirements},
-    id::{AppId, AppIncarnation, Attempt, BatchId, DeviceIndex, JobId, JobKey, LinkId, NodeId, NodeSession},
+    id::{
+        AppId, AppIncarnation, Attempt, BatchId, DeviceIndex, JobId, JobKey, LinkId, NodeId, NodeSession,
+        StealId,
+    },
     message::{Contact, CostNs, JobFailure, WaitReason},
     time::Instant,
 };
@@ -31,6 +34,8 @@ pub(super) enum Peer {
 pub(super) struct App {
     pub(super) name: String,
     pub(super) weight: f64,
+    /// Its queued jobs may be moved to balance nodes.
+    pub(super) global_stealing: bool,
     pub(super) incarnation: AppIncarnation,
     /// `None` while it is away; then `lease_until` runs.
     pub(super) link: Option<LinkId>,
@@ -78,6 +83,8 @@ pub(super) struct Job {
     pub(super) crashes: u32,
     /// The node that lost it last: another one is preferred.
     pub(super) avoid: Option<NodeId>,
+    /// Nodes it was stolen from, in order: it is never stolen back.
+    pub(super) stolen_from: Vec<NodeId>,
 }
 
 /// Where a job is, as far as the coordinator knows.
@@ -111,6 +118,8 @@ pub(super) struct Placement {
     pub(super) planned_at: Instant,
     /// What the job adds to the device's queue.
     pub(super) load_ns: u64,
+    /// The steal that asks its node to give it up.
+    pub(super) retracting: Option<StealId>,
 }
 
 /// Jobs of one batch that have no place.
@@ -140,6 +149,11 @@ pub(super) struct Node {
     pub(super) recheck: Option<Recheck>,
     /// Jobs placed or executed here.
     pub(super) jobs: BTreeSet<JobId>,
+    /// It joined and has not stolen yet: it may take jobs of any application.
+    pub(super) joining: bool,
+    /// When it may try to steal again, and how often in a row it tried in vain.
+    pub(super) steal_at: Instant,
+    pub(super) vain_steals: u32,
 }
 
 impl Node {

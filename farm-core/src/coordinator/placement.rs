@@ -191,6 +191,7 @@ impl CoordinatorMachine {
                 attempt,
                 planned_at: now,
                 load_ns: want.load_ns,
+                retracting: None,
             });
             app.waiting_jobs -= 1;
             if let Some(batch) = app.batches.get_mut(&job.batch) {
@@ -206,6 +207,7 @@ impl CoordinatorMachine {
         for share in shares.into_iter().filter(|share| !share.jobs.is_empty()) {
             let Some(node) = self.nodes.get_mut(&share.node) else { continue };
             node.jobs.extend(share.jobs.iter().map(|job| job.job));
+            node.joining = false;
             if let Some(device) = node.device_mut(share.device) {
                 device.queued_ns += share.load_ns;
                 device.planned_jobs += share.jobs.len() as u64;
@@ -315,7 +317,15 @@ fn take_in(app: &mut App, request: &PlanRequest) -> Intake {
             Some(_) => {}
             None => {
                 let (batch, cost) = (request.batch, planned.cost);
-                app.jobs.insert(key, Job { batch, cost, state: JobState::Waiting, crashes: 0, avoid: None });
+                let job = Job {
+                    batch,
+                    cost,
+                    state: JobState::Waiting,
+                    crashes: 0,
+                    avoid: None,
+                    stolen_from: Vec::new(),
+                };
+                app.jobs.insert(key, job);
                 intake.fresh.push(key);
             }
         }

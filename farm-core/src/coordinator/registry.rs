@@ -207,6 +207,7 @@ impl CoordinatorMachine {
         let app = App {
             name: hello.name,
             weight: hello.weight,
+            global_stealing: hello.global_stealing,
             incarnation,
             link: Some(link),
             heard: false,
@@ -268,6 +269,9 @@ impl CoordinatorMachine {
             full_until: None,
             recheck: None,
             jobs: BTreeSet::new(),
+            joining: true,
+            steal_at: now,
+            vain_steals: 0,
         };
         self.nodes.insert(id, node);
     }
@@ -279,6 +283,7 @@ impl CoordinatorMachine {
             self.effects.push_back(Effect::ToNode { link, message: CoordinatorToNode::Refused { reason } });
             self.close(link);
         }
+        self.end_steals_from(id);
         let kept = self.inherited(id, hello);
         self.remove_node(now, id, Blame::OldestOnEachDevice);
         self.add_node(now, id, hello);

@@ -36,6 +36,7 @@ pub(super) enum Blame {
 impl CoordinatorMachine {
     /// Removes a node; its undelivered jobs get into line for new attempts.
     pub(super) fn remove_node(&mut self, now: Instant, id: NodeId, blame: Blame) {
+        self.end_steals_from(id);
         let Some(node) = self.nodes.remove(&id) else { return };
         if let Some(link) = node.link {
             self.close(link);
@@ -59,8 +60,9 @@ impl CoordinatorMachine {
 
     /// Compares what a node says it holds with what it should hold.
     pub(super) fn reconcile(&mut self, now: Instant, id: NodeId, inventory: &[JobAttempt]) {
-        let Some(node) = self.nodes.get(&id) else { return };
         let held: BTreeMap<JobId, Attempt> = inventory.iter().map(|item| (item.job, item.attempt)).collect();
+        self.settle_interrupted_steals(id, &held);
+        let Some(node) = self.nodes.get(&id) else { return };
         let mut doubtful = Vec::new();
         for &job in &node.jobs {
             let Some((_, attempt)) = self.holder(job) else { continue };
@@ -277,7 +279,7 @@ impl CoordinatorMachine {
         self.apps.get_mut(&id.app)?.jobs.get_mut(&JobKey::of(id))
     }
 
-    fn job(&self, id: JobId) -> Option<&Job> {
+    pub(super) fn job(&self, id: JobId) -> Option<&Job> {
         self.apps.get(&id.app)?.jobs.get(&JobKey::of(id))
     }
 
@@ -293,7 +295,7 @@ impl CoordinatorMachine {
     }
 
     /// Takes jobs off a node that still stands.
-    fn move_off(&mut self, id: NodeId, jobs: Vec<JobId>) {
+    pub(super) fn move_off(&mut self, id: NodeId, jobs: Vec<JobId>) {
         let mut cancelled = Vec::with_capacity(jobs.len());
         for job in jobs {
             if let Some((_, attempt)) = self.holder(job) {

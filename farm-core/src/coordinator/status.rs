@@ -16,6 +16,12 @@ impl CoordinatorMachine {
         }
     }
 
+    /// Jobs that moved from one node to another by stealing, since this start.
+    #[must_use]
+    pub const fn stolen_jobs(&self) -> u64 {
+        self.stolen_jobs
+    }
+
     fn node_statuses(&self) -> Vec<NodeStatus> {
         let devices = |node: &super::model::Node| {
             (0_u16..)

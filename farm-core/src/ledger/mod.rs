@@ -172,7 +172,7 @@ pub struct LedgerCounts {
     pub delivered_jobs: u64,
     /// Failed for good.
     pub failed_jobs: u64,
-    /// New attempts after losses.
+    /// New attempts after losses and steals.
     pub replanned_jobs: u64,
 }
 

@@ -4,7 +4,7 @@
 //! It never sees payloads: its driver keeps programs, contents and results by [`JobAttempt`] and [`ContentHash`].
 //!
 //! Split by event family: `session` (coordinator), `app` (applications and their links), `intake` (jobs that arrive or
-//! leave early), `content`, `device` (staging, stealing, completion), `lottery`, `spool` (results until acknowledged),
+//! leave early), `retract` (jobs that another node takes over), `content`, `device` (staging, stealing, completion), `lottery`, `spool` (results until acknowledged),
 //! `report`, `drain`. `job` holds the records they share.
 
 mod app;
@@ -16,6 +16,7 @@ mod invariants;
 mod job;
 mod lottery;
 mod report;
+mod retract;
 mod session;
 mod spool;
 

@@ -81,6 +81,7 @@ impl WorkerMachine {
             CoordinatorToNode::AppJoined { app, weight } => self.app_joined(app, weight),
             CoordinatorToNode::AppLeft { app } => self.app_left(app),
             CoordinatorToNode::Cancel { jobs } => jobs.into_iter().for_each(|job| self.cancel(job)),
+            CoordinatorToNode::Retract { steal, jobs } => self.retract(steal, &jobs),
             CoordinatorToNode::Drain => self.start_drain(now),
             CoordinatorToNode::HeartbeatAck { sequence } => self.reports.confirm(sequence),
         }

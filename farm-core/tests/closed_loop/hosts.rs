@@ -40,6 +40,8 @@ pub(crate) struct Work {
 pub(crate) struct WorkerHost {
     index: usize,
     speeds: Vec<f64>,
+    /// What each announced score is times the true one.
+    score_errors: Vec<f64>,
     max_jobs: usize,
     pub(crate) life: u32,
     pub(crate) session: NodeSession,
@@ -63,10 +65,17 @@ struct Executor {
 }
 
 impl WorkerHost {
-    pub(crate) fn new(index: usize, speeds: &[f64], max_jobs: usize, seed: u64) -> Self {
+    pub(crate) fn new(
+        index: usize,
+        speeds: &[f64],
+        score_errors: Vec<f64>,
+        max_jobs: usize,
+        seed: u64,
+    ) -> Self {
         let mut host = Self {
             index,
             speeds: speeds.to_vec(),
+            score_errors,
             max_jobs,
             life: 0,
             session: NodeSession(0),
@@ -89,10 +98,11 @@ impl WorkerHost {
         let devices = self
             .speeds
             .iter()
-            .map(|speed| DeviceInfo {
+            .zip(&self.score_errors)
+            .map(|(speed, error)| DeviceInfo {
                 name: format!("sim {speed}"),
                 kind: DeviceKind::Simulated,
-                score: speed * 1_000.0,
+                score: speed * error * 1_000.0,
                 features: Features::default(),
                 limits: Limits::UNBOUNDED,
             })
@@ -168,11 +178,12 @@ pub(crate) struct AppHost {
 }
 
 impl AppHost {
-    pub(crate) fn new(index: usize) -> Self {
+    pub(crate) fn new(index: usize, global_stealing: bool) -> Self {
         let hello = AppHello {
             protocol: PROTOCOL_VERSION,
             name: format!("app-{index}"),
             weight: 1.0 + f64::from(u32::try_from(index).expect("few applications")),
+            global_stealing,
             resume: None,
         };
         Self {

@@ -3,6 +3,7 @@
 
 mod faults;
 mod hosts;
+mod steals;
 mod world;
 
 use std::time::Duration;
@@ -86,6 +87,8 @@ fn calm(seed: u64) -> World {
         apps: 2,
         max_crashes: 3,
         max_jobs: 10_000,
+        global_stealing: false,
+        score_error: 1.0,
     };
     World::new(&setup)
 }
@@ -94,7 +97,15 @@ fn calm(seed: u64) -> World {
 fn stormy(seed: u64) -> World {
     // Crashes here are nobody's fault, so they must not add up to poison.
     let workers = vec![vec![0.2], vec![0.4, 0.2], vec![0.6]];
-    let setup = Setup { seed, workers, apps: 2, max_crashes: 1_000, max_jobs: 100 };
+    let setup = Setup {
+        seed,
+        workers,
+        apps: 2,
+        max_crashes: 1_000,
+        max_jobs: 100,
+        global_stealing: !seed.is_multiple_of(3),
+        score_error: if seed.is_multiple_of(2) { 1.0 } else { 3.0 },
+    };
     let mut world = World::new(&setup);
     for app in 0..2 {
         for task in 0..3 {
@@ -140,7 +151,15 @@ fn unequal_devices_get_shares_by_their_speed() {
 
 #[test]
 fn jobs_wait_for_the_first_node_and_say_so() {
-    let setup = Setup { seed: 3, workers: vec![], apps: 1, max_crashes: 3, max_jobs: 100 };
+    let setup = Setup {
+        seed: 3,
+        workers: vec![],
+        apps: 1,
+        max_crashes: 3,
+        max_jobs: 100,
+        global_stealing: false,
+        score_error: 1.0,
+    };
     let mut world = World::new(&setup);
     submit(&mut world, 0, 0, 0, 10);
     world.run_for(Duration::from_millis(500));

@@ -95,6 +95,10 @@ pub(crate) struct Setup {
     pub(crate) max_crashes: u32,
     /// Most jobs on one worker.
     pub(crate) max_jobs: usize,
+    /// The applications allow it.
+    pub(crate) global_stealing: bool,
+    /// Announced scores are wrong by up to this factor, either way.
+    pub(crate) score_error: f64,
 }
 
 /// The farm.
@@ -111,6 +115,7 @@ pub(crate) struct World {
     pub(crate) duplicate_one_in: u32,
     max_crashes: u32,
     max_jobs: usize,
+    score_error: f64,
     epoch: u32,
     links: BTreeMap<LinkId, Link>,
     next_link: u64,
@@ -149,6 +154,7 @@ impl World {
             duplicate_one_in: 0,
             max_crashes: setup.max_crashes,
             max_jobs: setup.max_jobs,
+            score_error: setup.score_error,
             epoch: 1,
             links: BTreeMap::new(),
             next_link: 1,
@@ -162,7 +168,7 @@ impl World {
             world.add_worker(speeds);
         }
         for app in 0..setup.apps {
-            world.apps.push(AppHost::new(app));
+            world.apps.push(AppHost::new(app, setup.global_stealing));
             world.after(Duration::ZERO, Happening::Dial { proc: Proc::App(app), life: 0 });
         }
         world
@@ -171,7 +177,13 @@ impl World {
     pub(crate) fn add_worker(&mut self, speeds: &[f64]) {
         let index = self.workers.len();
         let seed = self.rng.random();
-        self.workers.push(WorkerHost::new(index, speeds, self.max_jobs, seed));
+        let bound = self.score_error;
+        let errors = if bound > 1.0 {
+            speeds.iter().map(|_| bound.powf(self.rng.random_range(-1.0..=1.0))).collect()
+        } else {
+            vec![1.0; speeds.len()]
+        };
+        self.workers.push(WorkerHost::new(index, speeds, errors, self.max_jobs, seed));
         self.after(Duration::ZERO, Happening::Dial { proc: Proc::Worker(index), life: 0 });
     }
 

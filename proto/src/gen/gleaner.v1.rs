@@ -782,6 +782,9 @@ pub struct AppHello {
     /// Who the application was before its connection broke.
     #[prost(message, optional, tag = "4")]
     pub resume: ::core::option::Option<AppIdentity>,
+    /// Whether queued jobs may be moved between nodes to balance them.
+    #[prost(bool, tag = "5")]
+    pub global_stealing: bool,
 }
 /// An application and which life of it.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
@@ -1275,7 +1278,7 @@ pub mod apps_server {
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct NodeToCoordinator {
     /// One of these.
-    #[prost(oneof = "node_to_coordinator::Message", tags = "1, 2, 3, 4, 5")]
+    #[prost(oneof = "node_to_coordinator::Message", tags = "1, 2, 3, 4, 5, 6")]
     pub message: ::core::option::Option<node_to_coordinator::Message>,
 }
 /// Nested message and enum types in `NodeToCoordinator`.
@@ -1298,6 +1301,9 @@ pub mod node_to_coordinator {
         /// A drained node leaves.
         #[prost(message, tag = "5")]
         Goodbye(super::Nothing),
+        /// Answer to a retract order.
+        #[prost(message, tag = "6")]
+        Retracted(super::Retracted),
     }
 }
 /// A node's first message.
@@ -1374,6 +1380,22 @@ pub struct ExecutedFailure {
     #[prost(message, optional, tag = "2")]
     pub failure: ::core::option::Option<JobFailure>,
 }
+/// Answer to a retract order: each of its attempts is in one of the three lists.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct Retracted {
+    /// Of the order answered.
+    #[prost(uint64, tag = "1")]
+    pub steal: u64,
+    /// Will never run here.
+    #[prost(message, optional, tag = "2")]
+    pub retracted: ::core::option::Option<Attempts>,
+    /// Run or ran here, and stay.
+    #[prost(message, optional, tag = "3")]
+    pub running: ::core::option::Option<Attempts>,
+    /// Ended here, or another attempt is here.
+    #[prost(message, optional, tag = "4")]
+    pub unknown: ::core::option::Option<Attempts>,
+}
 /// A device is gone.
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct DeviceLost {
@@ -1388,7 +1410,7 @@ pub struct DeviceLost {
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct CoordinatorToNode {
     /// One of these.
-    #[prost(oneof = "coordinator_to_node::Message", tags = "1, 2, 3, 4, 5, 6, 7")]
+    #[prost(oneof = "coordinator_to_node::Message", tags = "1, 2, 3, 4, 5, 6, 7, 8")]
     pub message: ::core::option::Option<coordinator_to_node::Message>,
 }
 /// Nested message and enum types in `CoordinatorToNode`.
@@ -1417,6 +1439,9 @@ pub mod coordinator_to_node {
         /// Answer to a heartbeat.
         #[prost(message, tag = "7")]
         HeartbeatAck(super::HeartbeatAck),
+        /// Give these attempts up unless they run, and answer.
+        #[prost(message, tag = "8")]
+        Retract(super::Retract),
     }
 }
 /// Registered.
@@ -1441,6 +1466,16 @@ pub struct AppJoined {
     /// Fair-share weight, > 0 and finite.
     #[prost(double, tag = "2")]
     pub weight: f64,
+}
+/// Give these attempts up unless they run, and answer.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct Retract {
+    /// Repeated in the answer.
+    #[prost(uint64, tag = "1")]
+    pub steal: u64,
+    /// Which.
+    #[prost(message, optional, tag = "2")]
+    pub jobs: ::core::option::Option<Attempts>,
 }
 /// Everything of an application can be freed.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]

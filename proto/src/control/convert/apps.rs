@@ -54,7 +54,13 @@ impl TryFrom<v1::AppToCoordinator> for AppToCoordinator {
 impl From<AppHello> for v1::AppHello {
     fn from(hello: AppHello) -> Self {
         let resume = hello.resume.map(|(app, life)| v1::AppIdentity { app: app.0, incarnation: life.0 });
-        Self { protocol: hello.protocol, name: hello.name, weight: hello.weight, resume }
+        Self {
+            protocol: hello.protocol,
+            name: hello.name,
+            weight: hello.weight,
+            resume,
+            global_stealing: hello.global_stealing,
+        }
     }
 }
 
@@ -66,6 +72,7 @@ impl TryFrom<v1::AppHello> for AppHello {
             protocol: wire.protocol,
             name: name("AppHello.name", wire.name)?,
             weight: weight("AppHello.weight", wire.weight)?,
+            global_stealing: wire.global_stealing,
             resume: wire.resume.map(|was| (AppId(was.app), AppIncarnation(was.incarnation))),
         })
     }

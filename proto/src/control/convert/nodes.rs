@@ -1,7 +1,7 @@
 //! Worker nodes and the coordinator.
 
 use farm_core::{
-    id::{AppId, Epoch, JobAttempt, NodeId, NodeSession},
+    id::{AppId, Epoch, JobAttempt, NodeId, NodeSession, StealId},
     message::{CoordinatorToNode, DeviceLoad, Executed, JobFailure, NodeHello, NodeToCoordinator},
 };
 
@@ -22,6 +22,14 @@ impl From<NodeToCoordinator> for v1::NodeToCoordinator {
             }
             NodeToCoordinator::DeviceLost { device, reason } => {
                 Message::DeviceLost(v1::DeviceLost { device: device.0.into(), reason: cut(reason) })
+            }
+            NodeToCoordinator::Retracted { steal, retracted, running, unknown } => {
+                Message::Retracted(v1::Retracted {
+                    steal: steal.0,
+                    retracted: Some(retracted.as_slice().into()),
+                    running: Some(running.as_slice().into()),
+                    unknown: Some(unknown.as_slice().into()),
+                })
             }
             NodeToCoordinator::Goodbye => Message::Goodbye(v1::Nothing {}),
         };
@@ -51,6 +59,12 @@ impl TryFrom<v1::NodeToCoordinator> for NodeToCoordinator {
             Message::DeviceLost(lost) => Self::DeviceLost {
                 device: device("DeviceLost.device", lost.device)?,
                 reason: text("DeviceLost.reason", lost.reason)?,
+            },
+            Message::Retracted(answer) => Self::Retracted {
+                steal: StealId(answer.steal),
+                retracted: required("Retracted.retracted", answer.retracted)?.try_into()?,
+                running: required("Retracted.running", answer.running)?.try_into()?,
+                unknown: required("Retracted.unknown", answer.unknown)?.try_into()?,
             },
             Message::Goodbye(v1::Nothing {}) => Self::Goodbye,
         })
@@ -162,6 +176,9 @@ impl From<CoordinatorToNode> for v1::CoordinatorToNode {
             }
             CoordinatorToNode::AppLeft { app } => Message::AppLeft(v1::AppLeft { app: app.0 }),
             CoordinatorToNode::Cancel { jobs } => Message::Cancel(jobs.as_slice().into()),
+            CoordinatorToNode::Retract { steal, jobs } => {
+                Message::Retract(v1::Retract { steal: steal.0, jobs: Some(jobs.as_slice().into()) })
+            }
             CoordinatorToNode::Drain => Message::Drain(v1::Nothing {}),
             CoordinatorToNode::HeartbeatAck { sequence } => {
                 Message::HeartbeatAck(v1::HeartbeatAck { sequence })
@@ -188,6 +205,10 @@ impl TryFrom<v1::CoordinatorToNode> for CoordinatorToNode {
             }
             Message::AppLeft(v1::AppLeft { app }) => Self::AppLeft { app: AppId(app) },
             Message::Cancel(jobs) => Self::Cancel { jobs: jobs.try_into()? },
+            Message::Retract(order) => Self::Retract {
+                steal: StealId(order.steal),
+                jobs: required("Retract.jobs", order.jobs)?.try_into()?,
+            },
             Message::Drain(v1::Nothing {}) => Self::Drain,
             Message::HeartbeatAck(v1::HeartbeatAck { sequence }) => Self::HeartbeatAck { sequence },
         })

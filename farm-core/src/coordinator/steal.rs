@@ -1,0 +1,394 @@
+//! What moves between nodes: global stealing by the retract protocol (10-scheduling.md section 3), and the same towards
+//! a node that joined.
+//!
+//! A steal names attempts to the victim, which alone says what it gives up; only then a new attempt goes to the thief.
+//! Whatever happens to the order or its answer, each job stays on the books of exactly one node.
+//!
+//! Decisions are between pools: the devices of one kind on one node, which share work by local stealing.
+
+use std::{
+    collections::{BTreeMap, BTreeSet},
+    time::Duration,
+};
+
+use super::{
+    CoordinatorMachine, NodeState,
+    model::{App, Calibration, Device, Job, JobState, Node, Placement},
+};
+use crate::{
+    device::DeviceKind,
+    id::{AppId, Attempt, DeviceIndex, JobAttempt, JobId, JobKey, NodeId, StealId},
+    message::CoordinatorToNode,
+    time::Instant,
+};
+
+/// What a steal takes from the decision until its first job may start on the thief, in nanoseconds (10 ms). Four
+/// messages (retract, answer, plan, ticket) of at most 1 ms each on a LAN, 5 ms that the victim's reports may be old,
+/// 1 ms for staging.
+pub(super) const STEAL_LATENCY_NS: f64 = 10e6;
+
+/// The least gain worth a steal, as a part of the job's finish on the victim: below it the estimates' errors decide.
+const LEAST_GAIN: f64 = 0.2;
+
+/// Most steals of one job.
+pub(super) const MAX_STEALS: usize = 3;
+
+/// How long a stolen job stays where it is, in milliseconds (ten steal latencies). The node does not report starts;
+/// by then it has the job in its queue and its books are true.
+const REST_MS: u64 = 100;
+
+/// Most jobs of one steal. More would keep a victim of many small jobs at it for long.
+const MAX_STOLEN_JOBS: usize = 4_096;
+
+/// Most victims that are looked into for one thief at a time.
+const MAX_VICTIMS: usize = 4;
+
+/// How long an answer may take before the thief may try elsewhere, in milliseconds. A later answer still counts.
+const ANSWER_MS: u64 = 1_000;
+
+/// Pause after the first try in vain, in milliseconds; it doubles with each further one.
+const PAUSE_MS: u64 = 10;
+
+/// The pause doubles at most this often: 640 ms.
+const MAX_DOUBLINGS: u32 = 6;
+
+/// A retract order without an answer.
+#[derive(Debug)]
+pub(super) struct Steal {
+    pub(super) thief: NodeId,
+    /// Which of the thief's devices asked.
+    kind: DeviceKind,
+    pub(super) victim: NodeId,
+    /// As they were when the order left; some may have ended since.
+    pub(super) jobs: BTreeMap<JobId, Attempt>,
+    load_ns: u128,
+    pub(super) answer_by: Instant,
+}
+
+/// The devices of one kind on one node.
+#[derive(Clone, Copy, Debug)]
+struct Pool {
+    node: NodeId,
+    kind: DeviceKind,
+    devices: usize,
+    jobs: u64,
+    queued_ns: f64,
+    rate: f64,
+    fastest: f64,
+}
+
+impl Pool {
+    fn of(id: NodeId, node: &Node, kind: DeviceKind, calibration: &Calibration) -> Option<Self> {
+        let empty = Self { node: id, kind, devices: 0, jobs: 0, queued_ns: 0.0, rate: 0.0, fastest: 0.0 };
+        let of_kind = node.devices.iter().filter(|device| !device.lost && device.info.kind == kind);
+        let pool = of_kind.fold(empty, |pool, device| {
+            let rate = device.rate(calibration);
+            Self {
+                devices: pool.devices + 1,
+                jobs: pool.jobs + device.planned_jobs,
+                queued_ns: pool.queued_ns + device.queued_ns as f64,
+                rate: pool.rate + rate,
+                fastest: pool.fastest.max(rate),
+                ..pool
+            }
+        });
+        (pool.devices > 0).then_some(pool)
+    }
+
+    /// How long its work takes, in nanoseconds.
+    fn remaining_ns(&self) -> f64 {
+        self.queued_ns / self.rate
+    }
+
+    /// Whether what is not on a device yet lasts no longer than a steal.
+    fn is_low(&self) -> bool {
+        let waiting = 1.0 - self.devices as f64 / self.jobs.max(1) as f64;
+        self.remaining_ns() * waiting <= STEAL_LATENCY_NS
+    }
+}
+
+impl CoordinatorMachine {
+    /// A node was heard: if it will soon be out of work, it gets some of another's.
+    pub(super) fn consider_stealing(&mut self, now: Instant, id: NodeId) {
+        let Some(node) = self.nodes.get(&id).filter(|node| node.takes_work() && node.steal_at <= now) else {
+            return;
+        };
+        let wanted = node.joining || self.apps.values().any(|app| app.global_stealing);
+        if !wanted || self.steals.values().any(|steal| steal.thief == id) {
+            return;
+        }
+        let kinds: BTreeSet<DeviceKind> = node.devices.iter().map(|device| device.info.kind).collect();
+        let mut low = false;
+        for kind in kinds {
+            let pool = Pool::of(id, node, kind, &self.calibration);
+            let Some(thief) = pool.filter(Pool::is_low) else { continue };
+            low = true;
+            if let Some((victim, jobs)) = self.find_loot(now, &thief) {
+                self.order(now, &thief, victim, jobs);
+                return;
+            }
+        }
+        if low {
+            self.stole_in_vain(now, id);
+        }
+    }
+
+    /// The victim's answer. What it gave up is free, whether or not the steal is still known.
+    pub(super) fn retracted(&mut self, now: Instant, victim: NodeId, id: StealId, given_up: &[JobAttempt]) {
+        let steal = match self.steals.get(&id) {
+            Some(steal) if steal.victim == victim => self.end_steal(id),
+            Some(_) | None => None,
+        };
+        let mut moved: BTreeMap<AppId, Vec<JobKey>> = BTreeMap::new();
+        for job in given_up {
+            let state = self.job(job.job).map(|job| job.state);
+            let Some(JobState::Placed(place)) = state else { continue };
+            if (place.node, place.attempt) != (victim, job.attempt) {
+                continue;
+            }
+            if steal.as_ref().is_some_and(|steal| self.move_job(now, job.job, place, steal)) {
+                moved.entry(job.job.app).or_default().push(JobKey::of(job.job));
+            } else {
+                self.requeue(job.job, None);
+            }
+        }
+        if let Some(steal) = steal {
+            if moved.is_empty() {
+                self.stole_in_vain(now, steal.thief);
+            } else if let Some(thief) = self.nodes.get_mut(&steal.thief) {
+                thief.joining = false;
+                thief.vain_steals = 0;
+            }
+        }
+        for (app, keys) in moved {
+            self.stolen_jobs += keys.len() as u64;
+            self.repeat_plan(app, &keys);
+        }
+    }
+
+    /// Orders to a node that is gone, or in a new life, will have no answer. Its jobs stay on its books.
+    pub(super) fn end_steals_from(&mut self, victim: NodeId) {
+        for id in self.steals_from(victim) {
+            self.end_steal(id);
+        }
+    }
+
+    /// A victim is back on a new connection: order or answer went with the old one. What it does not hold it gave up,
+    /// or it ended, or its ticket is still on the way: a new attempt is right in each case.
+    pub(super) fn settle_interrupted_steals(&mut self, victim: NodeId, held: &BTreeMap<JobId, Attempt>) {
+        for id in self.steals_from(victim) {
+            let Some(steal) = self.end_steal(id) else { continue };
+            let gone = |(job, attempt): &(JobId, Attempt)| {
+                held.get(job) != Some(attempt) && self.is_placed(*job, victim, *attempt)
+            };
+            let gone: Vec<JobId> = steal.jobs.into_iter().filter(gone).map(|(job, _)| job).collect();
+            self.move_off(victim, gone);
+        }
+    }
+
+    pub(super) fn expire_steals(&mut self, now: Instant) {
+        let due: Vec<(StealId, NodeId)> = self
+            .steals
+            .iter()
+            .filter(|(_, steal)| steal.answer_by <= now)
+            .map(|(&id, steal)| (id, steal.thief))
+            .collect();
+        for (id, thief) in due {
+            self.end_steal(id);
+            self.stole_in_vain(now, thief);
+        }
+    }
+
+    /// The jobs that the thief should have, by the victim with the most work left that has any for it.
+    fn find_loot(&self, now: Instant, thief: &Pool) -> Option<(NodeId, Vec<(JobId, Placement)>)> {
+        let mut victims: Vec<Pool> = Vec::new();
+        for (&id, node) in self.nodes.iter().filter(|(id, node)| **id != thief.node && can_answer(node)) {
+            let kinds: BTreeSet<DeviceKind> = node.devices.iter().map(|device| device.info.kind).collect();
+            for kind in kinds {
+                let Some(mut pool) = Pool::of(id, node, kind, &self.calibration) else { continue };
+                pool.queued_ns = (pool.queued_ns - self.leaving_ns(id)).max(0.0);
+                if pool.remaining_ns() > thief.remaining_ns() + 2.0 * STEAL_LATENCY_NS {
+                    victims.push(pool);
+                }
+            }
+        }
+        victims.sort_by(|one, other| other.remaining_ns().total_cmp(&one.remaining_ns()));
+        victims.iter().take(MAX_VICTIMS).find_map(|victim| {
+            let jobs = self.loot(now, thief, victim);
+            (!jobs.is_empty()).then_some((victim.node, jobs))
+        })
+    }
+
+    /// From the tail of the victim's queue, as much as makes both finish together.
+    fn loot(&self, now: Instant, thief: &Pool, victim: &Pool) -> Vec<(JobId, Placement)> {
+        let delay = STEAL_LATENCY_NS.max(thief.remaining_ns());
+        let most = thief.rate * (victim.queued_ns - delay * victim.rate) / (victim.rate + thief.rate);
+        if most <= 0.0 {
+            return Vec::new();
+        }
+        let mut taken = 0.0;
+        let mut jobs = Vec::new();
+        for (job, place) in self.stealable(now, thief, victim) {
+            let load = place.load_ns as f64;
+            let on_thief = delay + ((taken + load) / thief.rate).max(load / thief.fastest);
+            let on_victim = (victim.queued_ns - taken) / victim.rate;
+            let gain = on_victim - on_thief;
+            let least =
+                if jobs.is_empty() { (2.0 * STEAL_LATENCY_NS).max(LEAST_GAIN * on_victim) } else { 0.0 };
+            if taken + load > most || gain <= least || jobs.len() == MAX_STOLEN_JOBS {
+                break;
+            }
+            taken += load;
+            jobs.push((job, place));
+        }
+        jobs
+    }
+
+    /// The jobs of the victim that the thief may have, last planned first, without those that must be on a device.
+    fn stealable(&self, now: Instant, thief: &Pool, victim: &Pool) -> Vec<(JobId, Placement)> {
+        let (Some(from), Some(to)) = (self.nodes.get(&victim.node), self.nodes.get(&thief.node)) else {
+            return Vec::new();
+        };
+        let mut placed: Vec<(Attempt, JobId, Placement)> = Vec::new();
+        for &id in &from.jobs {
+            let Some(JobState::Placed(place)) = self.job(id).map(|job| job.state) else { continue };
+            let kind = from.devices.get(usize::from(place.device.0)).map(|device| device.info.kind);
+            if kind == Some(victim.kind) {
+                placed.push((place.attempt, id, place));
+            }
+        }
+        placed.sort_unstable_by_key(|(attempt, _, _)| *attempt);
+        placed
+            .into_iter()
+            .skip(victim.devices)
+            .rev()
+            .filter(|(_, id, place)| self.may_move(now, *id, *place, thief, to))
+            .map(|(_, id, place)| (id, place))
+            .collect()
+    }
+
+    fn may_move(&self, now: Instant, id: JobId, place: Placement, thief: &Pool, to: &Node) -> bool {
+        let Some(app) = self.apps.get(&id.app) else { return false };
+        let Some(job) = app.jobs.get(&JobKey::of(id)) else { return false };
+        let rested =
+            job.stolen_from.is_empty() || now.since(place.planned_at) >= Duration::from_millis(REST_MS);
+        (app.global_stealing || to.joining)
+            && reaches(app, now, thief.node)
+            && place.retracting.is_none()
+            && rested
+            && job.stolen_from.len() < MAX_STEALS
+            && !job.stolen_from.contains(&thief.node)
+            && fitting(app, job, to, thief.kind).next().is_some()
+    }
+
+    fn order(&mut self, now: Instant, thief: &Pool, victim: NodeId, jobs: Vec<(JobId, Placement)>) {
+        let id = StealId(self.next_steal);
+        self.next_steal += 1;
+        let answer_by = now.after(Duration::from_millis(ANSWER_MS));
+        let load_ns = jobs.iter().map(|(_, place)| u128::from(place.load_ns)).sum();
+        let attempts: Vec<JobAttempt> =
+            jobs.iter().map(|&(job, place)| JobAttempt { job, attempt: place.attempt }).collect();
+        for &job in &attempts {
+            if let Some(JobState::Placed(place)) = self.job_mut(job.job).map(|job| &mut job.state) {
+                place.retracting = Some(id);
+            }
+        }
+        let jobs = attempts.iter().map(|job| (job.job, job.attempt)).collect();
+        let (thief, kind) = (thief.node, thief.kind);
+        tracing::debug!(steal = %id, %thief, %victim, jobs = attempts.len(), "stealing");
+        self.steals.insert(id, Steal { thief, kind, victim, jobs, load_ns, answer_by });
+        self.arm(answer_by);
+        self.tell_node(victim, CoordinatorToNode::Retract { steal: id, jobs: attempts });
+    }
+
+    /// Gives a job that its victim gave up to the thief. False if the thief cannot take it (any more).
+    fn move_job(&mut self, now: Instant, id: JobId, from: Placement, steal: &Steal) -> bool {
+        let Some(app) = self.apps.get(&id.app).filter(|app| reaches(app, now, steal.thief)) else {
+            return false;
+        };
+        let Some(job) = app.jobs.get(&JobKey::of(id)) else { return false };
+        let Some(thief) = self.nodes.get(&steal.thief).filter(|node| node.takes_work()) else { return false };
+        let free_at = |device: &Device| device.queued_ns as f64 / device.rate(&self.calibration);
+        let earliest = fitting(app, job, thief, steal.kind)
+            .min_by(|(_, one), (_, other)| free_at(one).total_cmp(&free_at(other)));
+        let Some((device, _)) = earliest else { return false };
+        self.release(id.app, JobKey::of(id), JobState::Placed(from));
+        let attempt = Attempt { epoch: self.config.epoch, sequence: self.next_attempt };
+        self.next_attempt += 1;
+        let Some(job) = self.job_mut(id) else { return false };
+        job.stolen_from.push(from.node);
+        let place =
+            Placement { node: steal.thief, device, attempt, planned_at: now, retracting: None, ..from };
+        job.state = JobState::Placed(place);
+        let Some(thief) = self.nodes.get_mut(&steal.thief) else { return false };
+        thief.jobs.insert(id);
+        if let Some(device) = thief.device_mut(device) {
+            device.add_load(from.load_ns);
+        }
+        true
+    }
+
+    /// Forgets an order: its jobs may be stolen again.
+    fn end_steal(&mut self, id: StealId) -> Option<Steal> {
+        let steal = self.steals.remove(&id)?;
+        for &job in steal.jobs.keys() {
+            if let Some(JobState::Placed(place)) = self.job_mut(job).map(|job| &mut job.state)
+                && place.retracting == Some(id)
+            {
+                place.retracting = None;
+            }
+        }
+        Some(steal)
+    }
+
+    fn stole_in_vain(&mut self, now: Instant, id: NodeId) {
+        let Some(node) = self.nodes.get_mut(&id) else { return };
+        let pause_ms = PAUSE_MS << node.vain_steals.min(MAX_DOUBLINGS);
+        node.vain_steals = node.vain_steals.saturating_add(1);
+        node.steal_at = now.after(Duration::from_millis(pause_ms));
+    }
+
+    fn steals_from(&self, victim: NodeId) -> Vec<StealId> {
+        self.steals.iter().filter(|(_, steal)| steal.victim == victim).map(|(&id, _)| id).collect()
+    }
+
+    /// What a node was asked to give up.
+    fn leaving_ns(&self, victim: NodeId) -> f64 {
+        self.steals.values().filter(|steal| steal.victim == victim).map(|steal| steal.load_ns as f64).sum()
+    }
+
+    fn is_placed(&self, job: JobId, node: NodeId, attempt: Attempt) -> bool {
+        match self.job(job).map(|job| job.state) {
+            Some(JobState::Placed(place)) => (place.node, place.attempt) == (node, attempt),
+            Some(JobState::Waiting | JobState::Executed { .. }) | None => false,
+        }
+    }
+}
+
+/// Whether a node can be asked to give jobs up now. A draining one gives them back by itself.
+fn can_answer(node: &Node) -> bool {
+    match node.state {
+        NodeState::Alive => node.link.is_some(),
+        NodeState::Suspect | NodeState::Draining => false,
+    }
+}
+
+/// Whether the application can send jobs to a node now.
+fn reaches(app: &App, now: Instant, node: NodeId) -> bool {
+    app.link.is_some() && app.unreachable.get(&node).is_none_or(|until| *until <= now)
+}
+
+/// The devices of a kind that fulfil a job's needs.
+fn fitting<'node>(
+    app: &App,
+    job: &Job,
+    node: &'node Node,
+    kind: DeviceKind,
+) -> impl Iterator<Item = (DeviceIndex, &'node Device)> + use<'node> {
+    let needs = app.batches.get(&job.batch).map(|batch| batch.needs);
+    (0_u16..).map(DeviceIndex).zip(&node.devices).filter(move |(_, device)| {
+        !device.lost
+            && device.info.kind == kind
+            && needs.is_some_and(|needs| needs.fulfilled_by(&device.info))
+    })
+}
