@@ -1,7 +1,7 @@
 //! What the executors say, with each result's digest computed where the result was made: on the device's own thread, not on
 //! the owner task.
 
-use std::{collections::VecDeque, time::Duration};
+use std::collections::VecDeque;
 
 use bytes::Bytes;
 use farm_core::{
@@ -85,15 +85,13 @@ impl Device {
         self.submit_waiting();
     }
 
-    /// Takes a job back; true if it had not reached the executor, which then says nothing more about it.
-    pub(crate) fn abort(&mut self, job: JobAttempt) -> bool {
+    /// Takes a job back. One that had not reached the executor is not heard of again.
+    pub(crate) fn abort(&mut self, job: JobAttempt) {
         let before = self.waiting.len();
         self.waiting.retain(|order| order.job != job);
-        let removed = self.waiting.len() < before;
-        if !removed {
+        if self.waiting.len() == before {
             self.executor.abort(job);
         }
-        removed
     }
 
     fn submit_waiting(&mut self) {
@@ -110,14 +108,4 @@ impl Device {
             }
         }
     }
-}
-
-/// An order for a device.
-pub(crate) fn order(
-    job: JobAttempt,
-    program: farm_core::program::JobProgram,
-    contents: Vec<(ContentHash, Bytes)>,
-    limit: Duration,
-) -> Order {
-    Order { job, program: std::sync::Arc::new(program), contents, limit }
 }

@@ -15,7 +15,7 @@ use farm_core::{
     time,
     worker::{Effect, Event, WorkerConfig, WorkerMachine},
 };
-use gpu_exec::Executor;
+use gpu_exec::{Executor, Order};
 use proto::{
     codec,
     control::{SessionError, SessionSender},
@@ -29,7 +29,7 @@ use tokio::{
 use crate::{
     End, WorkerOptions,
     content::ContentCache,
-    device::{self, Device, DeviceEvent, DeviceNews},
+    device::{Device, DeviceEvent, DeviceNews},
     link::{self, Outbox},
     payload::Payloads,
     session::{self, NodeLink},
@@ -428,7 +428,8 @@ impl Driver {
                     .into_iter()
                     .filter_map(|hash| Some((hash, self.contents.get(&hash)?)))
                     .collect();
-                device.execute(device::order(job, program, contents, self.options.job_limit));
+                let (program, limit) = (Arc::new(program), self.options.job_limit);
+                device.execute(Order { job, program, contents, limit });
             }
             (program, _) => {
                 let reason = program.err().unwrap_or_else(|| format!("{index} does not exist"));
