@@ -134,7 +134,7 @@ impl CoordinatorMachine {
     }
 
     /// Books inherited jobs on the new life of their node, and tells their applications.
-    pub(super) fn inherit(&mut self, id: NodeId, kept: &[JobId]) {
+    pub(super) fn inherit(&mut self, now: Instant, id: NodeId, kept: &[JobId]) {
         let mut by_app: BTreeMap<AppId, Vec<JobKey>> = BTreeMap::new();
         for &job in kept {
             let state = self.job(job).map(|job| job.state);
@@ -143,7 +143,7 @@ impl CoordinatorMachine {
             if let Some(JobState::Placed(place)) = state
                 && let Some(device) = node.device_mut(place.device)
             {
-                device.add_load(place.load_ns);
+                device.add_load(now, place.load);
                 by_app.entry(job.app).or_default().push(JobKey::of(job));
             }
         }
@@ -229,7 +229,7 @@ impl CoordinatorMachine {
         if let JobState::Placed(place) = state
             && let Some(device) = node.device_mut(place.device)
         {
-            device.drop_load(place.load_ns);
+            device.drop_load(place.load);
         }
     }
 

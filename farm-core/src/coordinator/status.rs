@@ -22,6 +22,12 @@ impl CoordinatorMachine {
         self.stolen_jobs
     }
 
+    /// Batches that were placed first come, first served because a plug-in failed, since this start.
+    #[must_use]
+    pub const fn policy_fallbacks(&self) -> u64 {
+        self.policy_fallbacks
+    }
+
     fn node_statuses(&self) -> Vec<NodeStatus> {
         let devices = |node: &super::model::Node| {
             (0_u16..)
@@ -34,7 +40,7 @@ impl CoordinatorMachine {
                     kind: device.info.kind,
                     score: device.info.score,
                     planned_jobs: device.planned_jobs,
-                    running_jobs: device.running_jobs,
+                    running_jobs: device.running.is_some().into(),
                     executed_jobs: device.executed_jobs,
                     device_time_ns: device.device_time_ns,
                 })

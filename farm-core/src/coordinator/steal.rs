@@ -13,7 +13,9 @@ use std::{
 
 use super::{
     CoordinatorMachine, NodeState,
-    model::{App, Calibration, Device, Job, JobState, Node, Placement},
+    model::{App, Device, Job, JobState, Node, Placement},
+    placement::FETCH_NS_PER_BYTE,
+    rates::{Module, Modules},
 };
 use crate::{
     device::DeviceKind,
@@ -22,10 +24,38 @@ use crate::{
     time::Instant,
 };
 
-/// What a steal takes from the decision until its first job may start on the thief, in nanoseconds (10 ms). Four
-/// messages (retract, answer, plan, ticket) of at most 1 ms each on a LAN, 5 ms that the victim's reports may be old,
-/// 1 ms for staging.
-pub(super) const STEAL_LATENCY_NS: f64 = 10e6;
+/// What a steal takes besides messages, in nanoseconds (6 ms): 5 ms that the victim's reports may be old, 1 ms for
+/// staging.
+const STEAL_OVERHEAD_NS: f64 = 6e6;
+
+/// What an answer is taken to need before the first one came, in nanoseconds (2 ms): two messages on a LAN.
+const FIRST_ANSWER_NS: f64 = 2e6;
+
+/// Weight of a new answer in the mean time of answers.
+const ANSWER_GAIN: f64 = 0.2;
+
+/// What a steal takes from the decision until its first job may start on the thief. Four messages of like ways (retract,
+/// answer, plan, ticket), of which the first two are measured, and the rest.
+#[derive(Debug)]
+pub(super) struct StealLatency {
+    answer_ns: f64,
+}
+
+impl Default for StealLatency {
+    fn default() -> Self {
+        Self { answer_ns: FIRST_ANSWER_NS }
+    }
+}
+
+impl StealLatency {
+    pub(super) fn ns(&self) -> f64 {
+        2.0 * self.answer_ns + STEAL_OVERHEAD_NS
+    }
+
+    fn answered(&mut self, after: Duration) {
+        self.answer_ns += ANSWER_GAIN * (after.as_nanos() as f64 - self.answer_ns);
+    }
+}
 
 /// The least gain worth a steal, as a part of the job's finish on the victim: below it the estimates' errors decide.
 const LEAST_GAIN: f64 = 0.2;
@@ -61,49 +91,64 @@ pub(super) struct Steal {
     pub(super) victim: NodeId,
     /// As they were when the order left; some may have ended since.
     pub(super) jobs: BTreeMap<JobId, Attempt>,
-    load_ns: u128,
+    /// Time that they take the victim, in nanoseconds.
+    leaving_ns: f64,
+    ordered_at: Instant,
     pub(super) answer_by: Instant,
 }
 
 /// The devices of one kind on one node.
-#[derive(Clone, Copy, Debug)]
-struct Pool {
+#[derive(Debug)]
+struct Pool<'farm> {
     node: NodeId,
     kind: DeviceKind,
-    devices: usize,
+    devices: Vec<&'farm Device>,
+    modules: &'farm Modules,
     jobs: u64,
-    queued_ns: f64,
-    rate: f64,
-    fastest: f64,
+    /// How long its work takes, in nanoseconds.
+    remaining_ns: f64,
 }
 
-impl Pool {
-    fn of(id: NodeId, node: &Node, kind: DeviceKind, calibration: &Calibration) -> Option<Self> {
-        let empty = Self { node: id, kind, devices: 0, jobs: 0, queued_ns: 0.0, rate: 0.0, fastest: 0.0 };
-        let of_kind = node.devices.iter().filter(|device| !device.lost && device.info.kind == kind);
-        let pool = of_kind.fold(empty, |pool, device| {
-            let rate = device.rate(calibration);
-            Self {
-                devices: pool.devices + 1,
-                jobs: pool.jobs + device.planned_jobs,
-                queued_ns: pool.queued_ns + device.queued_ns as f64,
-                rate: pool.rate + rate,
-                fastest: pool.fastest.max(rate),
-                ..pool
+impl<'farm> Pool<'farm> {
+    fn of(
+        now: Instant,
+        id: NodeId,
+        node: &'farm Node,
+        kind: DeviceKind,
+        modules: &'farm Modules,
+    ) -> Option<Self> {
+        let of_kind = |device: &&Device| !device.lost && device.info.kind == kind;
+        let devices: Vec<&Device> = node.devices.iter().filter(of_kind).collect();
+        let jobs = devices.iter().map(|device| device.planned_jobs).sum();
+        let mut pool = Self { node: id, kind, devices, modules, jobs, remaining_ns: 0.0 };
+        // What each device has left, in the time that all of them together take for it.
+        let mut queued: BTreeMap<Module, f64> = BTreeMap::new();
+        for device in &pool.devices {
+            let queued_ns = device.throughput.queued_ns(modules);
+            let left = if queued_ns > 0.0 { device.free_at_ns(now, modules) / queued_ns } else { 0.0 };
+            for (module, amount) in device.throughput.queued() {
+                *queued.entry(module).or_default() += amount as f64 * left;
             }
-        });
-        (pool.devices > 0).then_some(pool)
+        }
+        pool.remaining_ns = queued.into_iter().map(|(module, amount)| amount / pool.rate(module)).sum();
+        (!pool.devices.is_empty()).then_some(pool)
     }
 
-    /// How long its work takes, in nanoseconds.
-    fn remaining_ns(&self) -> f64 {
-        self.queued_ns / self.rate
+    /// Load per nanosecond of all its devices.
+    fn rate(&self, module: Module) -> f64 {
+        self.devices.iter().map(|device| device.throughput.rate(self.modules, module)).sum()
+    }
+
+    /// Load per nanosecond of its fastest device.
+    fn fastest(&self, module: Module) -> f64 {
+        let rates = self.devices.iter().map(|device| device.throughput.rate(self.modules, module));
+        rates.fold(0.0, f64::max)
     }
 
     /// Whether what is not on a device yet lasts no longer than a steal.
-    fn is_low(&self) -> bool {
-        let waiting = 1.0 - self.devices as f64 / self.jobs.max(1) as f64;
-        self.remaining_ns() * waiting <= STEAL_LATENCY_NS
+    fn is_low(&self, latency_ns: f64) -> bool {
+        let waiting = 1.0 - self.devices.len() as f64 / self.jobs.max(1) as f64;
+        self.remaining_ns * waiting <= latency_ns
     }
 }
 
@@ -120,11 +165,11 @@ impl CoordinatorMachine {
         let kinds: BTreeSet<DeviceKind> = node.devices.iter().map(|device| device.info.kind).collect();
         let mut low = false;
         for kind in kinds {
-            let pool = Pool::of(id, node, kind, &self.calibration);
-            let Some(thief) = pool.filter(Pool::is_low) else { continue };
+            let pool = Pool::of(now, id, node, kind, &self.modules);
+            let Some(thief) = pool.filter(|pool| pool.is_low(self.steal_latency.ns())) else { continue };
             low = true;
             if let Some((victim, jobs)) = self.find_loot(now, &thief) {
-                self.order(now, &thief, victim, jobs);
+                self.order(now, (id, kind), victim, jobs);
                 return;
             }
         }
@@ -136,7 +181,10 @@ impl CoordinatorMachine {
     /// The victim's answer. What it gave up is free, whether or not the steal is still known.
     pub(super) fn retracted(&mut self, now: Instant, victim: NodeId, id: StealId, given_up: &[JobAttempt]) {
         let steal = match self.steals.get(&id) {
-            Some(steal) if steal.victim == victim => self.end_steal(id),
+            Some(steal) if steal.victim == victim => {
+                self.steal_latency.answered(now.since(steal.ordered_at));
+                self.end_steal(id)
+            }
             Some(_) | None => None,
         };
         let mut moved: BTreeMap<AppId, Vec<JobKey>> = BTreeMap::new();
@@ -200,52 +248,56 @@ impl CoordinatorMachine {
     }
 
     /// The jobs that the thief should have, by the victim with the most work left that has any for it.
-    fn find_loot(&self, now: Instant, thief: &Pool) -> Option<(NodeId, Vec<(JobId, Placement)>)> {
-        let mut victims: Vec<Pool> = Vec::new();
+    fn find_loot(&self, now: Instant, thief: &Pool<'_>) -> Option<(NodeId, Vec<(JobId, Placement)>)> {
+        let mut victims: Vec<Pool<'_>> = Vec::new();
         for (&id, node) in self.nodes.iter().filter(|(id, node)| **id != thief.node && can_answer(node)) {
             let kinds: BTreeSet<DeviceKind> = node.devices.iter().map(|device| device.info.kind).collect();
             for kind in kinds {
-                let Some(mut pool) = Pool::of(id, node, kind, &self.calibration) else { continue };
-                pool.queued_ns = (pool.queued_ns - self.leaving_ns(id)).max(0.0);
-                if pool.remaining_ns() > thief.remaining_ns() + 2.0 * STEAL_LATENCY_NS {
+                let Some(mut pool) = Pool::of(now, id, node, kind, &self.modules) else { continue };
+                pool.remaining_ns = (pool.remaining_ns - self.leaving_ns(id)).max(0.0);
+                if pool.remaining_ns > thief.remaining_ns + 2.0 * self.steal_latency.ns() {
                     victims.push(pool);
                 }
             }
         }
-        victims.sort_by(|one, other| other.remaining_ns().total_cmp(&one.remaining_ns()));
+        victims.sort_by(|one, other| other.remaining_ns.total_cmp(&one.remaining_ns));
         victims.iter().take(MAX_VICTIMS).find_map(|victim| {
             let jobs = self.loot(now, thief, victim);
             (!jobs.is_empty()).then_some((victim.node, jobs))
         })
     }
 
-    /// From the tail of the victim's queue, as much as makes both finish together.
-    fn loot(&self, now: Instant, thief: &Pool, victim: &Pool) -> Vec<(JobId, Placement)> {
-        let delay = STEAL_LATENCY_NS.max(thief.remaining_ns());
-        let most = thief.rate * (victim.queued_ns - delay * victim.rate) / (victim.rate + thief.rate);
-        if most <= 0.0 {
-            return Vec::new();
-        }
-        let mut taken = 0.0;
+    /// From the tail of the victim's queue, as much as makes both finish together: with R the work left on the victim,
+    /// s the rates and L the latency, `x = s_t (R - L s_v) / (s_v + s_t)` is where `L + x / s_t = (R - x) / s_v`.
+    fn loot(&self, now: Instant, thief: &Pool<'_>, victim: &Pool<'_>) -> Vec<(JobId, Placement)> {
+        let latency_ns = self.steal_latency.ns();
+        let delay_ns = latency_ns.max(thief.remaining_ns);
+        // Time that what was taken so far adds to the thief, and takes off the victim.
+        let (mut added_ns, mut spared_ns) = (0.0, 0.0);
         let mut jobs = Vec::new();
-        for (job, place) in self.stealable(now, thief, victim) {
-            let load = place.load_ns as f64;
-            let on_thief = delay + ((taken + load) / thief.rate).max(load / thief.fastest);
-            let on_victim = (victim.queued_ns - taken) / victim.rate;
-            let gain = on_victim - on_thief;
-            let least =
-                if jobs.is_empty() { (2.0 * STEAL_LATENCY_NS).max(LEAST_GAIN * on_victim) } else { 0.0 };
-            if taken + load > most || gain <= least || jobs.len() == MAX_STOLEN_JOBS {
+        for (job, place, fetch_ns) in self.stealable(now, thief, victim) {
+            let delay_ns = delay_ns.max(fetch_ns);
+            let amount = place.load.amount as f64;
+            let on_thief = amount / thief.rate(place.load.module);
+            let on_victim = amount / victim.rate(place.load.module);
+            let together = delay_ns + added_ns + on_thief <= victim.remaining_ns - spared_ns - on_victim;
+            let finish_there = victim.remaining_ns - spared_ns;
+            let alone = amount / thief.fastest(place.load.module);
+            let gain = finish_there - (delay_ns + (added_ns + on_thief).max(alone));
+            let least = if jobs.is_empty() { (2.0 * latency_ns).max(LEAST_GAIN * finish_there) } else { 0.0 };
+            if !together || gain <= least || jobs.len() == MAX_STOLEN_JOBS {
                 break;
             }
-            taken += load;
+            added_ns += on_thief;
+            spared_ns += on_victim;
             jobs.push((job, place));
         }
         jobs
     }
 
-    /// The jobs of the victim that the thief may have, last planned first, without those that must be on a device.
-    fn stealable(&self, now: Instant, thief: &Pool, victim: &Pool) -> Vec<(JobId, Placement)> {
+    /// The jobs of the victim that the thief may have, without those that must be on a device, with the time that bringing
+    /// their data takes: those whose data the thief holds first, among them the last planned first.
+    fn stealable(&self, now: Instant, thief: &Pool<'_>, victim: &Pool<'_>) -> Vec<(JobId, Placement, f64)> {
         let (Some(from), Some(to)) = (self.nodes.get(&victim.node), self.nodes.get(&thief.node)) else {
             return Vec::new();
         };
@@ -258,16 +310,27 @@ impl CoordinatorMachine {
             }
         }
         placed.sort_unstable_by_key(|(attempt, _, _)| *attempt);
-        placed
+        let mut stealable: Vec<(JobId, Placement, f64)> = placed
             .into_iter()
-            .skip(victim.devices)
+            .skip(victim.devices.len())
             .rev()
             .filter(|(_, id, place)| self.may_move(now, *id, *place, thief, to))
-            .map(|(_, id, place)| (id, place))
-            .collect()
+            .map(|(_, id, place)| (id, place, self.fetch_ns(id, to)))
+            .collect();
+        stealable.sort_by(|(.., one), (.., other)| one.total_cmp(other));
+        stealable
     }
 
-    fn may_move(&self, now: Instant, id: JobId, place: Placement, thief: &Pool, to: &Node) -> bool {
+    /// What bringing a job's contents to a node takes.
+    fn fetch_ns(&self, id: JobId, to: &Node) -> f64 {
+        let batch = self.apps.get(&id.app).and_then(|app| {
+            let job = app.jobs.get(&JobKey::of(id))?;
+            app.batches.get(&job.batch)
+        });
+        batch.map_or(0.0, |batch| to.missing_bytes(&batch.contents) as f64 * FETCH_NS_PER_BYTE)
+    }
+
+    fn may_move(&self, now: Instant, id: JobId, place: Placement, thief: &Pool<'_>, to: &Node) -> bool {
         let Some(app) = self.apps.get(&id.app) else { return false };
         let Some(job) = app.jobs.get(&JobKey::of(id)) else { return false };
         let rested =
@@ -281,11 +344,21 @@ impl CoordinatorMachine {
             && fitting(app, job, to, thief.kind).next().is_some()
     }
 
-    fn order(&mut self, now: Instant, thief: &Pool, victim: NodeId, jobs: Vec<(JobId, Placement)>) {
+    fn order(
+        &mut self,
+        now: Instant,
+        (thief, kind): (NodeId, DeviceKind),
+        victim: NodeId,
+        jobs: Vec<(JobId, Placement)>,
+    ) {
         let id = StealId(self.next_steal);
         self.next_steal += 1;
         let answer_by = now.after(Duration::from_millis(ANSWER_MS));
-        let load_ns = jobs.iter().map(|(_, place)| u128::from(place.load_ns)).sum();
+        let pool = self.nodes.get(&victim).and_then(|node| Pool::of(now, victim, node, kind, &self.modules));
+        let time_on = |pool: Pool<'_>| {
+            jobs.iter().map(|(_, place)| place.load.amount as f64 / pool.rate(place.load.module)).sum()
+        };
+        let leaving_ns = pool.map_or(0.0, time_on);
         let attempts: Vec<JobAttempt> =
             jobs.iter().map(|&(job, place)| JobAttempt { job, attempt: place.attempt }).collect();
         for &job in &attempts {
@@ -294,9 +367,8 @@ impl CoordinatorMachine {
             }
         }
         let jobs = attempts.iter().map(|job| (job.job, job.attempt)).collect();
-        let (thief, kind) = (thief.node, thief.kind);
         tracing::debug!(steal = %id, %thief, %victim, jobs = attempts.len(), "stealing");
-        self.steals.insert(id, Steal { thief, kind, victim, jobs, load_ns, answer_by });
+        self.steals.insert(id, Steal { thief, kind, victim, jobs, leaving_ns, ordered_at: now, answer_by });
         self.arm(answer_by);
         self.tell_node(victim, CoordinatorToNode::Retract { steal: id, jobs: attempts });
     }
@@ -308,7 +380,10 @@ impl CoordinatorMachine {
         };
         let Some(job) = app.jobs.get(&JobKey::of(id)) else { return false };
         let Some(thief) = self.nodes.get(&steal.thief).filter(|node| node.takes_work()) else { return false };
-        let free_at = |device: &Device| device.queued_ns as f64 / device.rate(&self.calibration);
+        let free_at = |device: &Device| {
+            let job_ns = from.load.amount as f64 / device.throughput.rate(&self.modules, from.load.module);
+            device.free_at_ns(now, &self.modules) + job_ns
+        };
         let earliest = fitting(app, job, thief, steal.kind)
             .min_by(|(_, one), (_, other)| free_at(one).total_cmp(&free_at(other)));
         let Some((device, _)) = earliest else { return false };
@@ -320,10 +395,13 @@ impl CoordinatorMachine {
         let place =
             Placement { node: steal.thief, device, attempt, planned_at: now, retracting: None, ..from };
         job.state = JobState::Placed(place);
+        let batch = self.apps.get(&id.app).and_then(|app| app.batches.get(&self.job(id)?.batch));
+        let contents = batch.map_or_else(Vec::new, |batch| batch.contents.clone());
         let Some(thief) = self.nodes.get_mut(&steal.thief) else { return false };
+        thief.will_hold(&contents);
         thief.jobs.insert(id);
         if let Some(device) = thief.device_mut(device) {
-            device.add_load(from.load_ns);
+            device.add_load(now, from.load);
         }
         true
     }
@@ -354,7 +432,7 @@ impl CoordinatorMachine {
 
     /// What a node was asked to give up.
     fn leaving_ns(&self, victim: NodeId) -> f64 {
-        self.steals.values().filter(|steal| steal.victim == victim).map(|steal| steal.load_ns as f64).sum()
+        self.steals.values().filter(|steal| steal.victim == victim).map(|steal| steal.leaving_ns).sum()
     }
 
     fn is_placed(&self, job: JobId, node: NodeId, attempt: Attempt) -> bool {
