@@ -316,6 +316,7 @@ fn ledger_event(step: Step) -> ledger::Event {
         },
         6..=9 => ledger::Event::FromCoordinator(CoordinatorToApp::Plan(Plan {
             batch: None,
+            speculative: step.four == 3,
             nodes: vec![NodePlan {
                 node,
                 session,

@@ -22,6 +22,7 @@ impl CoordinatorMachine {
         self.check_books();
         self.check_queue();
         self.check_steals();
+        self.check_backups();
     }
 
     fn check_links(&self) {
@@ -72,6 +73,8 @@ impl CoordinatorMachine {
                     .get(&job.app)
                     .and_then(|app| app.jobs.get(&JobKey::of(*job)))
                     .map(|job| job.state);
+                let backup = self.backups.get(job).copied().filter(|backup| backup.node == *id);
+                let state = backup.map(JobState::Placed).or(state);
                 let held = state.and_then(JobState::holder).map(|(node, _)| node);
                 assert_eq!(held, Some(*id), "I1: {id} has {job} on its books, which is elsewhere");
                 if let Some(JobState::Placed(place)) = state {

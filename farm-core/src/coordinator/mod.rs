@@ -4,7 +4,7 @@
 //! ([`LinkId`]) and carries the effects out.
 //!
 //! Split by event family: `registry` (who is there), `placement` (where jobs go, by a `policy`; `consult` asks plug-ins),
-//! `report` (what ended), `replan` (what was lost), `steal` (what moves between nodes), `lease` (who is silent), `status`
+//! `report` (what ended), `replan` (what was lost), `steal` (what moves between nodes), `speculate` (what runs twice at the tail), `lease` (who is silent), `status`
 //! (what operators see). `model` holds the state they share, `rates` what devices are worth.
 
 mod consult;
@@ -17,6 +17,7 @@ mod rates;
 mod registry;
 mod replan;
 mod report;
+mod speculate;
 mod status;
 mod steal;
 
@@ -26,14 +27,14 @@ use serde::{Deserialize, Serialize};
 
 use self::{
     consult::{Asked, PluginFaults},
-    model::{App, Node, Peer, Pending},
+    model::{App, Node, Peer, Pending, Placement},
     policy::{Choice, History, Question, QuestionId},
     rates::Modules,
     steal::{Steal, StealLatency},
 };
 use crate::{
     device::DeviceKind,
-    id::{AppId, BatchId, DeviceIndex, Epoch, JobKey, LinkId, NodeId, StealId},
+    id::{AppId, BatchId, DeviceIndex, Epoch, JobId, JobKey, LinkId, NodeId, StealId},
     message::{AppToCoordinator, CoordinatorToApp, CoordinatorToNode, Liveness, NodeToCoordinator},
     time::Instant,
 };
@@ -258,6 +259,9 @@ pub struct CoordinatorMachine {
     replanned_jobs: u64,
     stolen_jobs: u64,
     policy_fallbacks: u64,
+    /// Attempts beside those that the jobs' states name.
+    backups: BTreeMap<JobId, Placement>,
+    speculations: u64,
     effects: VecDeque<Effect>,
 }
 
@@ -290,6 +294,8 @@ impl CoordinatorMachine {
             replanned_jobs: 0,
             stolen_jobs: 0,
             policy_fallbacks: 0,
+            backups: BTreeMap::new(),
+            speculations: 0,
             effects: VecDeque::new(),
         }
     }
@@ -380,6 +386,7 @@ impl CoordinatorMachine {
             NodeToCoordinator::Hello(_) => self.protocol_error(now, link),
             NodeToCoordinator::Heartbeat { sequence, devices, spool_bytes: _ } => {
                 self.loads_reported(node, &devices);
+                self.consider_speculating(now, node);
                 self.tell_node(node, CoordinatorToNode::HeartbeatAck { sequence });
             }
             NodeToCoordinator::Report { sent_at: _, executed, delivered } => {

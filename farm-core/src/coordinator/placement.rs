@@ -125,7 +125,7 @@ impl CoordinatorMachine {
         let nodes: Vec<NodePlan> =
             grouped.into_iter().filter_map(|(node, devices)| self.node_plan(node, devices)).collect();
         if !nodes.is_empty() {
-            self.tell_app(id, CoordinatorToApp::Plan(Plan { batch: None, nodes }));
+            self.tell_app(id, CoordinatorToApp::Plan(Plan { batch: None, speculative: false, nodes }));
         }
     }
 
@@ -183,7 +183,10 @@ impl CoordinatorMachine {
         if pending.answers.is_none() {
             self.replanned_jobs += choices.len() as u64;
         }
-        self.tell_app(pending.app, CoordinatorToApp::Plan(Plan { batch: pending.answers, nodes }));
+        self.tell_app(
+            pending.app,
+            CoordinatorToApp::Plan(Plan { batch: pending.answers, speculative: false, nodes }),
+        );
     }
 
     /// Devices that may take jobs of a batch, by node and index.

@@ -75,6 +75,11 @@ impl Modules {
         module
     }
 
+    /// Whether a job of it was completed.
+    pub(super) fn is_known(&self, module: Module) -> bool {
+        self.entries.get(&module).is_some_and(|entry| entry.scale.0.is_some())
+    }
+
     /// Load per time that a point of score stands for.
     fn scale(&self, module: Module) -> f64 {
         let own = self.entries.get(&module).and_then(|entry| entry.scale.0);

@@ -121,6 +121,7 @@ impl CoordinatorMachine {
 
     /// The application is gone: everything of it is freed, here and on the nodes.
     pub(super) fn app_leaves(&mut self, id: AppId) {
+        self.drop_backups_of(id);
         let Some(app) = self.apps.remove(&id) else { return };
         for (key, job) in app.jobs {
             self.release(id, key, job.state);

@@ -5,7 +5,7 @@ use std::time::Duration;
 use super::{CoordinatorMachine, model::JobState, policy::Policy, rates::Load};
 use crate::{
     id::{DeviceIndex, JobAttempt, JobId, NodeId},
-    message::{DeviceLoad, Executed, JobFailure},
+    message::{CoordinatorToNode, DeviceLoad, Executed, JobFailure},
     time::Instant,
 };
 
@@ -47,12 +47,21 @@ impl CoordinatorMachine {
     fn executed(&mut self, now: Instant, node: NodeId, ended: Executed) {
         let Executed { job: JobAttempt { job: id, attempt }, device, device_time_ns, trace: _, failure } =
             ended;
+        let job = JobAttempt { job: id, attempt };
+        if self.is_backup(job, node) {
+            if failure.as_ref().is_some_and(JobFailure::can_be_retried) {
+                self.drop_backup(id);
+                return;
+            }
+            self.first_one_loses(id);
+        }
         // Reports of attempts that were replaced meanwhile change nothing.
         if self.holder(id) != Some((node, attempt)) {
             return;
         }
         match failure {
             None => {
+                self.drop_backup(id);
                 if let Some(load) = self.device_freed(node, JobAttempt { job: id, attempt }) {
                     self.account(now, node, device, id, load, device_time_ns);
                 }
@@ -66,8 +75,18 @@ impl CoordinatorMachine {
             Some(failure) if failure.can_be_retried() => self.crashed(id, failure, node),
             // Its application gets this failure from the node, as a result; nothing else is owed.
             Some(_) => {
+                self.drop_backup(id);
                 self.device_freed(node, JobAttempt { job: id, attempt });
             }
+        }
+    }
+
+    /// The second attempt ended first.
+    fn first_one_loses(&mut self, id: JobId) {
+        let loser = self.holder(id);
+        self.promote_backup(id);
+        if let Some((node, attempt)) = loser {
+            self.tell_node(node, CoordinatorToNode::Cancel { jobs: vec![JobAttempt { job: id, attempt }] });
         }
     }
 

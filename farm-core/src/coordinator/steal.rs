@@ -305,7 +305,7 @@ impl CoordinatorMachine {
         for &id in &from.jobs {
             let Some(JobState::Placed(place)) = self.job(id).map(|job| job.state) else { continue };
             let kind = from.devices.get(usize::from(place.device.0)).map(|device| device.info.kind);
-            if kind == Some(victim.kind) {
+            if place.node == victim.node && kind == Some(victim.kind) {
                 placed.push((place.attempt, id, place));
             }
         }

@@ -905,6 +905,9 @@ pub struct Plan {
     /// Grouped by node.
     #[prost(message, repeated, tag = "2")]
     pub nodes: ::prost::alloc::vec::Vec<NodePlan>,
+    /// These attempts are in addition to those that run already; the first result counts.
+    #[prost(bool, tag = "3")]
+    pub speculative: bool,
 }
 /// Attempts placed on one node.
 #[derive(Clone, PartialEq, ::prost::Message)]

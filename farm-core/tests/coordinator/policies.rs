@@ -1,142 +1,16 @@
 //! Which device a job goes to: rates per module, data that is there, and the policies an application may choose.
 
-#![allow(clippy::unwrap_used, reason = "a test that cannot go on panics")]
+use std::time::Duration;
 
-use std::{collections::BTreeMap, time::Duration};
-
+use farm_core::id::LinkId;
 use farm_core::{
-    coordinator::{
-        CoordinatorConfig, CoordinatorMachine, Effect, Event,
-        policy::{Choice, Question, QuestionId},
-    },
-    device::{DeviceInfo, DeviceKind, Features, Limits, Requirements},
-    id::{BatchId, ContentHash, DeviceIndex, Epoch, JobAttempt, JobIndex, LinkId, NodeSession, TaskId},
-    message::{
-        AppHello, AppToCoordinator, Contact, CoordinatorToApp, CostNs, Executed, JobTrace, NodeHello,
-        NodeToCoordinator, PROTOCOL_VERSION, Plan, PlanJob, PlanRequest,
-    },
+    coordinator::{Event, policy::Choice},
+    id::{ContentHash, JobAttempt},
+    message::NodeToCoordinator,
     program::Content,
-    time::Instant,
 };
 
-const APP: LinkId = LinkId(0);
-const MILLISECOND_NS: u64 = 1_000_000;
-
-/// A coordinator with one application and nodes of one device each, driven by hand.
-struct Farm {
-    machine: CoordinatorMachine,
-    now: Instant,
-    batches: u64,
-    questions: Vec<(QuestionId, String, Question)>,
-    refused: Option<String>,
-}
-
-impl Farm {
-    fn new(policy: &str, scores: &[f64]) -> Self {
-        let config = CoordinatorConfig {
-            plugins: ["spread".to_owned()].into(),
-            ..CoordinatorConfig::new(Epoch(1), 1)
-        };
-        let machine = CoordinatorMachine::new(config);
-        let mut farm = Self { machine, now: Instant::ZERO, batches: 0, questions: Vec::new(), refused: None };
-        for (node, &score) in (1..).zip(scores) {
-            farm.node_joins(node, score);
-        }
-        let hello = AppHello {
-            protocol: PROTOCOL_VERSION,
-            name: "app".to_owned(),
-            weight: 1.0,
-            global_stealing: false,
-            policy: policy.to_owned(),
-            resume: None,
-        };
-        farm.say(AppToCoordinator::Hello(hello));
-        farm
-    }
-
-    fn node_joins(&mut self, node: u64, score: f64) {
-        let info = DeviceInfo {
-            name: "sim".to_owned(),
-            kind: DeviceKind::Simulated,
-            score,
-            features: Features::default(),
-            limits: Limits::UNBOUNDED,
-        };
-        let message = NodeToCoordinator::Hello(NodeHello {
-            protocol: PROTOCOL_VERSION,
-            name: format!("node {node}"),
-            session: NodeSession(node),
-            devices: vec![info],
-            contact: Contact { addresses: Vec::new(), certificate_der: Vec::new() },
-            inventory: Vec::new(),
-        });
-        self.handle(Event::FromNode { link: LinkId(node), message });
-    }
-
-    fn say(&mut self, message: AppToCoordinator) -> BTreeMap<u64, Vec<JobAttempt>> {
-        self.handle(Event::FromApp { link: APP, message })
-    }
-
-    /// Takes an event in; gives the jobs planned in answer, by node.
-    fn handle(&mut self, event: Event) -> BTreeMap<u64, Vec<JobAttempt>> {
-        self.machine.handle(self.now, event);
-        self.settle()
-    }
-
-    fn settle(&mut self) -> BTreeMap<u64, Vec<JobAttempt>> {
-        self.machine.check_invariants();
-        let mut planned: BTreeMap<u64, Vec<JobAttempt>> = BTreeMap::new();
-        while let Some(effect) = self.machine.poll_effect() {
-            match effect {
-                Effect::ToApp { message: CoordinatorToApp::Plan(Plan { nodes, .. }), .. } => {
-                    for node in nodes {
-                        let jobs = node.devices.into_iter().flat_map(|device| device.jobs);
-                        planned.entry(node.session.0).or_default().extend(jobs);
-                    }
-                }
-                Effect::ToApp { message: CoordinatorToApp::Refused { reason }, .. } => {
-                    self.refused = Some(reason);
-                }
-                Effect::AskPolicy { id, plugin, question } => self.questions.push((id, plugin, question)),
-                Effect::ToApp { .. } | Effect::ToNode { .. } | Effect::Close { .. } => {}
-            }
-        }
-        planned
-    }
-
-    fn plan(&mut self, costs_ms: &[u64], module: u8, contents: &[Content]) -> BTreeMap<u64, Vec<JobAttempt>> {
-        self.batches += 1;
-        let jobs = (0..).zip(costs_ms).map(|(index, cost_ms)| PlanJob {
-            index: JobIndex(index),
-            cost: CostNs(cost_ms * MILLISECOND_NS),
-        });
-        let request = PlanRequest {
-            batch: BatchId(self.batches),
-            task: TaskId(u32::try_from(self.batches).unwrap()),
-            jobs: jobs.collect(),
-            needs: Requirements::ANY,
-            module: Some(ContentHash([module; 32])),
-            contents: contents.to_vec(),
-        };
-        self.say(AppToCoordinator::Plan(request))
-    }
-
-    /// A node has executed and delivered jobs, each in the time that `took_ms` says.
-    fn done(&mut self, node: u64, jobs: &[JobAttempt], took_ms: impl Fn(JobAttempt) -> u64) {
-        for &job in jobs {
-            let device_time_ns = took_ms(job) * MILLISECOND_NS;
-            self.now = self.now.after(Duration::from_nanos(device_time_ns));
-            let (device, trace, failure) = (DeviceIndex(0), JobTrace::default(), None);
-            let executed = vec![Executed { job, device, device_time_ns, trace, failure }];
-            let message = NodeToCoordinator::Report { sent_at: self.now, executed, delivered: vec![job] };
-            self.handle(Event::FromNode { link: LinkId(node), message });
-        }
-    }
-}
-
-fn count(planned: &BTreeMap<u64, Vec<JobAttempt>>, node: u64) -> usize {
-    planned.get(&node).map_or(0, Vec::len)
-}
+use crate::farm::{Farm, count};
 
 #[test]
 fn devices_are_rated_for_each_module_by_itself() {
