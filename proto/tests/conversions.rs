@@ -309,15 +309,18 @@ fn farm_status() -> impl Strategy<Value = FarmStatus> {
             device_time_ns: counts[3],
         },
     );
-    (any::<(u32, u64, u64)>(), vec(node, 0..4), vec(app, 0..4)).prop_map(
-        |((epoch, delivered, replanned), nodes, apps)| FarmStatus {
+    (any::<(u32, [u64; 5])>(), vec(node, 0..4), vec(app, 0..4)).prop_map(|((epoch, counts), nodes, apps)| {
+        FarmStatus {
             epoch: Epoch(epoch),
             nodes,
             apps,
-            delivered_jobs: delivered,
-            replanned_jobs: replanned,
-        },
-    )
+            delivered_jobs: counts[0],
+            replanned_jobs: counts[1],
+            stolen_jobs: counts[2],
+            speculations: counts[3],
+            policy_fallbacks: counts[4],
+        }
+    })
 }
 
 proptest! {

@@ -222,6 +222,12 @@ pub struct FarmStatus {
     pub delivered_jobs: u64,
     /// New attempts after a loss since this start.
     pub replanned_jobs: u64,
+    /// Jobs moved between nodes by stealing since this start.
+    pub stolen_jobs: u64,
+    /// Second attempts beside running ones since this start.
+    pub speculations: u64,
+    /// Batches placed first come, first served since this start because a plug-in failed.
+    pub policy_fallbacks: u64,
 }
 
 /// The coordinator.

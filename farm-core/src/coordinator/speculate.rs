@@ -161,12 +161,6 @@ impl CoordinatorMachine {
 }
 
 impl CoordinatorMachine {
-    /// Second attempts beside running ones, since this start.
-    #[must_use]
-    pub const fn speculations(&self) -> u64 {
-        self.speculations
-    }
-
     /// Each backup is on the books of its node, beside a job that is placed elsewhere.
     pub(super) fn check_backups(&self) {
         for (id, backup) in &self.backups {

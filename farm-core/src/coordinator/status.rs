@@ -13,6 +13,9 @@ impl CoordinatorMachine {
             apps: self.app_statuses(),
             delivered_jobs: self.delivered_jobs,
             replanned_jobs: self.replanned_jobs,
+            stolen_jobs: self.stolen_jobs,
+            speculations: self.speculations,
+            policy_fallbacks: self.policy_fallbacks,
         }
     }
 
@@ -20,12 +23,6 @@ impl CoordinatorMachine {
     #[must_use]
     pub const fn stolen_jobs(&self) -> u64 {
         self.stolen_jobs
-    }
-
-    /// Batches that were placed first come, first served because a plug-in failed, since this start.
-    #[must_use]
-    pub const fn policy_fallbacks(&self) -> u64 {
-        self.policy_fallbacks
     }
 
     fn node_statuses(&self) -> Vec<NodeStatus> {

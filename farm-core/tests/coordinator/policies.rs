@@ -93,7 +93,7 @@ fn a_plug_in_places_a_batch() {
     let planned = farm.handle(Event::PolicyAnswered { question: id, answer });
     let order: Vec<u32> = planned[&1].iter().map(|job| job.job.index.0).collect();
     assert_eq!(order, [2, 0, 1], "all on the slow one, in the order it said");
-    assert_eq!(farm.machine.policy_fallbacks(), 0);
+    assert_eq!(farm.machine.status().policy_fallbacks, 0);
 }
 
 #[test]
@@ -112,7 +112,7 @@ fn a_plug_in_that_fails_or_answers_nonsense_is_passed_over() {
         let (question, ..) = farm.questions.pop().unwrap();
         let planned = farm.handle(Event::PolicyAnswered { question, answer: answer.clone() });
         assert_eq!(count(&planned, 2), 2, "first come, first served to the faster one after {answer:?}");
-        assert_eq!(farm.machine.policy_fallbacks(), 1);
+        assert_eq!(farm.machine.status().policy_fallbacks, 1);
         let late =
             farm.handle(Event::PolicyAnswered { question, answer: Ok(vec![choice(0, 0), choice(1, 0)]) });
         assert!(late.is_empty(), "a second answer changes nothing");

@@ -31,7 +31,7 @@ fn backup(farm: &mut Farm, first: JobAttempt) -> JobAttempt {
 fn a_straggler_runs_a_second_time_on_an_idle_device() {
     let (mut farm, first) = tail();
     backup(&mut farm, first);
-    assert_eq!(farm.machine.speculations(), 1);
+    assert_eq!(farm.machine.status().speculations, 1);
     assert!(farm.heartbeat(2, None).is_empty(), "once");
 }
 
@@ -50,7 +50,7 @@ fn while_something_is_queued_nothing_runs_twice() {
     farm.heartbeat(1, Some((first, 100 * MILLISECOND_NS)));
     farm.node_joins(3, 1_000.0);
     assert!(!farm.speculative, "queued jobs move first");
-    assert_eq!(farm.machine.speculations(), 0);
+    assert_eq!(farm.machine.status().speculations, 0);
 }
 
 #[test]
