@@ -9,6 +9,12 @@ use crate::{
     time::Instant,
 };
 
+/// When more than this part of all nodes is due to be given up at once, the fault is rather on this side.
+const GUARDED_PART: f64 = 0.55;
+
+/// Fewer nodes than this are given up without ado: two of three may well have died.
+const LEAST_GUARDED_NODES: usize = 4;
+
 impl CoordinatorMachine {
     pub(super) fn app_heard(&mut self, now: Instant, id: AppId) {
         if let Some(app) = self.apps.get_mut(&id) {
@@ -58,7 +64,8 @@ impl CoordinatorMachine {
         let liveness = self.config.liveness;
         let nodes = self.nodes.values().flat_map(|node| {
             let recheck = node.recheck.as_ref().map(|recheck| recheck.at);
-            [Some(silence_deadline(&liveness, node)), node.full_until, recheck]
+            let silence = silence_deadline(&liveness, node);
+            [Some(self.guarded_until.map_or(silence, |until| silence.max(until))), node.full_until, recheck]
         });
         let apps = self.apps.values().flat_map(|app| {
             let lease = match app.link {
@@ -102,9 +109,29 @@ impl CoordinatorMachine {
         }
     }
 
-    /// The one place where nodes are given up for their silence. The guard against giving most of the farm up at once
-    /// (20-delivery.md, "most nodes vanish at once") belongs here: all who are due are seen together.
+    /// The one place where nodes are given up for their silence. If most of the farm is due at once nothing is planned anew
+    /// for as long as a node may be silent: then they are back, or gone indeed (20-delivery.md, "most nodes vanish at once").
     fn declare_dead(&mut self, now: Instant, dead: Vec<(NodeId, Blame)>) {
+        let most =
+            dead.len() >= LEAST_GUARDED_NODES && dead.len() as f64 > GUARDED_PART * self.nodes.len() as f64;
+        if most {
+            let guard = Duration::from_millis(self.config.liveness.dead_ms);
+            let until = *self.guarded_until.get_or_insert_with(|| {
+                tracing::error!(
+                    silent = dead.len(),
+                    of = self.nodes.len(),
+                    ?guard,
+                    "most nodes vanished at once"
+                );
+                now.after(guard)
+            });
+            if now < until {
+                return;
+            }
+        }
+        if !dead.is_empty() {
+            self.guarded_until = None;
+        }
         for (id, blame) in dead {
             self.remove_node(now, id, blame);
         }

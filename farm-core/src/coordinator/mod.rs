@@ -259,6 +259,8 @@ pub struct CoordinatorMachine {
     steals: BTreeMap<StealId, Steal>,
     next_steal: u64,
     steal_latency: StealLatency,
+    /// Most nodes fell silent at once: until then none is given up for it.
+    guarded_until: Option<Instant>,
     /// No later than the earliest deadline.
     wake: Option<Instant>,
     delivered_jobs: u64,
@@ -295,6 +297,7 @@ impl CoordinatorMachine {
             steals: BTreeMap::new(),
             next_steal: 1,
             steal_latency: StealLatency::default(),
+            guarded_until: None,
             wake: None,
             delivered_jobs: 0,
             replanned_jobs: 0,

@@ -4,7 +4,7 @@ use std::{collections::BTreeMap, time::Duration};
 
 use farm_core::{
     coordinator::{
-        CoordinatorConfig, CoordinatorMachine, Effect, Event,
+        CoordinatorConfig, CoordinatorMachine, Effect, Event, NodeState,
         policy::{Question, QuestionId},
     },
     device::{DeviceInfo, DeviceKind, Features, Limits, Requirements},
@@ -175,6 +175,38 @@ impl Farm {
 
     pub(crate) fn open_jobs(&self) -> u64 {
         self.machine.status().apps.iter().map(|app| app.waiting_jobs + app.outstanding_jobs).sum()
+    }
+
+    /// Lets time pass, the remaining nodes and the application alive, until something is planned.
+    pub(crate) fn wait_for_plan(&mut self) -> BTreeMap<u64, Vec<JobAttempt>> {
+        for _ in 0..1_000 {
+            let due = self.machine.poll_timeout().unwrap();
+            let planned = self.advance_to(due);
+            if !planned.is_empty() {
+                return planned;
+            }
+        }
+        panic!("nothing is planned any more")
+    }
+
+    pub(crate) fn advance_to_ms(&mut self, at_ms: u64) {
+        while self.machine.poll_timeout().is_some_and(|due| due.0 <= at_ms * MILLISECOND_NS) {
+            let due = self.machine.poll_timeout().unwrap();
+            assert!(self.advance_to(due).is_empty(), "nothing is planned before");
+        }
+        self.now = Instant(at_ms * MILLISECOND_NS);
+    }
+
+    fn advance_to(&mut self, due: Instant) -> BTreeMap<u64, Vec<JobAttempt>> {
+        self.now = self.now.max(due);
+        self.say(AppToCoordinator::Heartbeat { sequence: 1 });
+        let connected = self.machine.status().nodes;
+        for node in connected.iter().filter(|node| node.state == NodeState::Alive) {
+            let link: u64 = node.name.trim_start_matches("node ").parse().unwrap();
+            self.heartbeat(link, None);
+        }
+        self.machine.handle_timeout(self.now);
+        self.settle()
     }
 
     fn report(
