@@ -76,7 +76,11 @@ const MAX_VICTIMS: usize = 4;
 /// How long an answer may take before the thief may try elsewhere, in milliseconds. A later answer still counts.
 const ANSWER_MS: u64 = 1_000;
 
-/// Pause after the first try in vain, in milliseconds; it doubles with each further one.
+/// Pause after a look at the farm that found nothing to steal. A look costs some 100 ns for each node (and device), so the
+/// pause grows by 1 us with the square of the nodes: with every node looking it is a tenth of a core at most.
+const LOOKING_PAUSE: Duration = Duration::from_millis(2);
+
+/// Pause after the first refusal of a victim, in milliseconds; it doubles with each further one.
 const PAUSE_MS: u64 = 10;
 
 /// The pause doubles at most this often: 640 ms.
@@ -139,10 +143,20 @@ impl<'farm> Pool<'farm> {
         self.devices.iter().map(|device| device.throughput.rate(self.modules, module)).sum()
     }
 
-    /// Load per nanosecond of its fastest device.
-    fn fastest(&self, module: Module) -> f64 {
-        let rates = self.devices.iter().map(|device| device.throughput.rate(self.modules, module));
-        rates.fold(0.0, f64::max)
+    /// When each of its devices is done with what it has.
+    fn free_at_ns(&self, now: Instant) -> Vec<f64> {
+        self.devices.iter().map(|device| device.free_at_ns(now, self.modules)).collect()
+    }
+
+    /// The last job ends later than [`Self::remaining_ns`], since devices do not end together: by half a job of one device
+    /// on average, less what that job adds itself. In the time that all of them together take for a job.
+    fn unevenness(&self) -> f64 {
+        (self.devices.len() as f64 - 1.0) / 2.0
+    }
+
+    /// Whether some of its jobs must be off the devices still.
+    fn has_waiting(&self) -> bool {
+        self.jobs > self.devices.len() as u64
     }
 
     /// Whether what is not on a device yet lasts no longer than a steal.
@@ -174,7 +188,7 @@ impl CoordinatorMachine {
             }
         }
         if low {
-            self.stole_in_vain(now, id);
+            self.pause_looking(now, id);
         }
     }
 
@@ -255,7 +269,7 @@ impl CoordinatorMachine {
             for kind in kinds {
                 let Some(mut pool) = Pool::of(now, id, node, kind, &self.modules) else { continue };
                 pool.remaining_ns = (pool.remaining_ns - self.leaving_ns(id)).max(0.0);
-                if pool.remaining_ns > thief.remaining_ns + 2.0 * self.steal_latency.ns() {
+                if pool.has_waiting() {
                     victims.push(pool);
                 }
             }
@@ -267,28 +281,30 @@ impl CoordinatorMachine {
         })
     }
 
-    /// From the tail of the victim's queue, as much as makes both finish together: with R the work left on the victim,
-    /// s the rates and L the latency, `x = s_t (R - L s_v) / (s_v + s_t)` is where `L + x / s_t = (R - x) / s_v`.
+    /// From the tail of the victim's queue, each job that ends sooner on the thief. Where both finish together it ends:
+    /// `x = s_t (R - L s_v) / (s_v + s_t)` of 10-scheduling.md for small jobs, and whole jobs on whole devices for large ones.
     fn loot(&self, now: Instant, thief: &Pool<'_>, victim: &Pool<'_>) -> Vec<(JobId, Placement)> {
         let latency_ns = self.steal_latency.ns();
-        let delay_ns = latency_ns.max(thief.remaining_ns);
-        // Time that what was taken so far adds to the thief, and takes off the victim.
-        let (mut added_ns, mut spared_ns) = (0.0, 0.0);
+        let mut free_at_ns = thief.free_at_ns(now);
+        // Time that what was taken so far takes off the victim.
+        let mut spared_ns = 0.0;
         let mut jobs = Vec::new();
         for (job, place, fetch_ns) in self.stealable(now, thief, victim) {
-            let delay_ns = delay_ns.max(fetch_ns);
             let amount = place.load.amount as f64;
-            let on_thief = amount / thief.rate(place.load.module);
             let on_victim = amount / victim.rate(place.load.module);
-            let together = delay_ns + added_ns + on_thief <= victim.remaining_ns - spared_ns - on_victim;
-            let finish_there = victim.remaining_ns - spared_ns;
-            let alone = amount / thief.fastest(place.load.module);
-            let gain = finish_there - (delay_ns + (added_ns + on_thief).max(alone));
-            let least = if jobs.is_empty() { (2.0 * latency_ns).max(LEAST_GAIN * finish_there) } else { 0.0 };
-            if !together || gain <= least || jobs.len() == MAX_STOLEN_JOBS {
+            let there = victim.remaining_ns - spared_ns + victim.unevenness() * on_victim;
+            let finish = |(device, free_at): (usize, &f64)| {
+                let job_ns = amount / thief.devices[device].throughput.rate(thief.modules, place.load.module);
+                (device, free_at.max(latency_ns).max(fetch_ns) + job_ns)
+            };
+            let soonest =
+                free_at_ns.iter().enumerate().map(finish).min_by(|(_, one), (_, other)| one.total_cmp(other));
+            let Some((device, here)) = soonest else { break };
+            let least = if jobs.is_empty() { (2.0 * latency_ns).max(LEAST_GAIN * there) } else { 0.0 };
+            if there - here <= least || jobs.len() == MAX_STOLEN_JOBS {
                 break;
             }
-            added_ns += on_thief;
+            free_at_ns[device] = here;
             spared_ns += on_victim;
             jobs.push((job, place));
         }
@@ -417,6 +433,15 @@ impl CoordinatorMachine {
             }
         }
         Some(steal)
+    }
+
+    /// Nothing worth stealing was found.
+    fn pause_looking(&mut self, now: Instant, id: NodeId) {
+        let nodes = self.nodes.len() as u64;
+        let pause = LOOKING_PAUSE + Duration::from_micros(nodes.saturating_mul(nodes));
+        if let Some(node) = self.nodes.get_mut(&id) {
+            node.steal_at = now.after(pause);
+        }
     }
 
     fn stole_in_vain(&mut self, now: Instant, id: NodeId) {
