@@ -196,6 +196,12 @@ pub(crate) struct BenchArgs {
     /// Which figures.
     #[arg(value_enum)]
     pub name: BenchName,
+    /// Of everything random in a bench: tile times, wrong scores, the order of jobs.
+    #[arg(long, default_value_t = 1)]
+    pub seed: u64,
+    /// Runs of each measurement, of which the median counts; each bench has its own default.
+    #[arg(long, value_parser = clap::value_parser!(u8).range(1..=25))]
+    pub runs: Option<u8>,
     /// How they are printed (as before the verb).
     #[arg(short = 'o', long, value_enum, id = "bench_format")]
     pub output: Option<Format>,
@@ -213,6 +219,12 @@ pub(crate) struct VersionArgs {
 pub(crate) enum BenchName {
     /// Round trip of a no-op job, jobs a second, CPU time a job.
     Scheduler,
+    /// What stealing gains on irregular jobs, on equal and unequal devices; how soon an idle device is busy again.
+    Steal,
+    /// Shares of three applications of unequal weights and jobs; how soon a fourth one gets its first result.
+    Fairness,
+    /// Speed-up on equal jobs, by devices and by nodes.
+    Scaling,
 }
 
 /// An image size in pixels, both extents positive.

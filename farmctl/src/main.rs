@@ -8,6 +8,7 @@ mod command;
 mod embedded;
 mod failure;
 mod output;
+mod process_farm;
 mod progress;
 mod running;
 
@@ -49,7 +50,7 @@ fn run(cli: &Cli) -> Result<(), Failure> {
             Verb::Status(arguments) => command::status::run(arguments, coordinator, cli.output).await,
             Verb::Node(verb) => command::node::run(verb, coordinator).await,
             Verb::Bench(arguments) => {
-                Box::pin(bench::run(arguments.name, arguments.output.unwrap_or(cli.output))).await
+                Box::pin(bench::run(arguments, arguments.output.unwrap_or(cli.output))).await
             }
             Verb::Version(arguments) => command::version::run(arguments.output.unwrap_or(cli.output)),
         }

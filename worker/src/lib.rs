@@ -55,6 +55,8 @@ pub struct WorkerOptions {
     pub content_cache_bytes: u64,
     /// How long one job may run.
     pub job_limit: Duration,
+    /// Whether an idle device takes queued jobs of its siblings; off only for measuring what that gains.
+    pub local_stealing: bool,
     /// A folder for caches on disk. Checked to be writable; what is cached there comes with a later version.
     pub cache: Option<PathBuf>,
 }
@@ -72,6 +74,7 @@ impl WorkerOptions {
             connect_timeout: Duration::from_secs(10),
             content_cache_bytes: 4 << 30,
             job_limit: Duration::from_secs(600),
+            local_stealing: true,
             cache: None,
         }
     }
@@ -205,7 +208,7 @@ pub async fn start(options: WorkerOptions) -> Result<WorkerHandle, StartError> {
         devices: infos.clone(),
         contact: Contact { addresses: advertise, certificate_der: server.certificate_der().to_vec() },
         max_jobs: MAX_JOBS,
-        local_stealing: true,
+        local_stealing: options.local_stealing,
         lottery_gain: LOTTERY_GAIN,
         seed: identity,
     };

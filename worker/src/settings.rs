@@ -86,6 +86,25 @@ struct ConfigFile {
     job_limit: Option<String>,
     /// Most bytes of task allocations and modules kept in memory.
     content_cache_bytes: Option<u64>,
+    #[serde(default)]
+    scheduler: SchedulerSection,
+}
+
+/// What only who measures the scheduler changes.
+#[derive(Debug, Default, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct SchedulerSection {
+    /// Whether an idle device takes queued jobs of its siblings.
+    #[serde(default)]
+    local_stealing: Switch,
+}
+
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+enum Switch {
+    #[default]
+    On,
+    Off,
 }
 
 /// Checked options from everything the user said. Every error is a usage error and names flag, file or key.
@@ -125,6 +144,7 @@ pub(crate) fn options(arguments: Arguments) -> anyhow::Result<WorkerOptions> {
         )?,
         content_cache_bytes: file.content_cache_bytes.unwrap_or(defaults.content_cache_bytes),
         job_limit: duration("job_limit", file.job_limit, defaults.job_limit)?,
+        local_stealing: file.scheduler.local_stealing == Switch::On,
         cache: arguments.cache.or(file.cache),
         ..defaults
     })
@@ -247,6 +267,7 @@ mod tests {
         assert_eq!(from_file.connect_timeout, Duration::from_secs(300));
         assert_eq!(from_file.job_limit, Duration::from_millis(250));
         assert_eq!(from_file.content_cache_bytes, 77);
+        assert!(from_file.local_stealing, "on unless it is switched off");
 
         let sim = "sim:score=2,speed=3";
         let flags =
@@ -256,6 +277,16 @@ mod tests {
         assert_eq!(overruled.devices, [sim.parse().unwrap(), DeviceSpec::Cpu]);
         assert_eq!(overruled.advertise, ["y:1", "z:2"]);
         assert_eq!(overruled.listen.to_string(), "127.0.0.1:5", "what no flag says is the file's");
+    }
+
+    #[test]
+    fn local_stealing_is_switched_off_by_the_file_alone() {
+        let parsed =
+            |value: &str| parse(&COORDINATOR, Some(&format!("[scheduler]\nlocal_stealing = {value}\n")));
+        assert!(!parsed("'off'").unwrap().local_stealing);
+        assert!(parsed("'on'").unwrap().local_stealing);
+        let error = format!("{:#}", parsed("'maybe'").unwrap_err());
+        assert!(error.contains("line 2") && error.contains("maybe"), "{error}");
     }
 
     #[test]
