@@ -4,6 +4,8 @@
 //! One task owns the machine; everything else sends it messages. It never decides who runs what: the machine does.
 
 mod owner;
+pub mod plugins;
+pub mod policy_host;
 mod sessions;
 mod store;
 mod web;
@@ -29,6 +31,7 @@ use tokio::{
 
 use self::{
     owner::{Owner, OwnerHandle},
+    plugins::{PluginOptions, Plugins},
     sessions::Sessions,
     store::{ControlStore, FileStore, MemoryStore},
 };
@@ -49,6 +52,8 @@ pub struct CoordinatorOptions {
     pub liveness: Liveness,
     /// How long a vanished application keeps its jobs, in milliseconds.
     pub app_lease_ms: u64,
+    /// The plug-in policies that applications may choose; `None`: there are none.
+    pub plugins: Option<PluginOptions>,
 }
 
 impl Default for CoordinatorOptions {
@@ -59,6 +64,7 @@ impl Default for CoordinatorOptions {
             state: None,
             liveness: Liveness::default(),
             app_lease_ms: 30_000,
+            plugins: None,
         }
     }
 }
@@ -92,6 +98,14 @@ pub enum StartError {
     #[error("state directory {path}: {reason}")]
     State {
         /// Which.
+        path: PathBuf,
+        /// Why not.
+        reason: String,
+    },
+    /// The plug-in folder, a plug-in or the plug-ins' host cannot be used.
+    #[error("plug-in {path}: {reason}")]
+    Plugin {
+        /// Folder or file.
         path: PathBuf,
         /// Why not.
         reason: String,
@@ -163,6 +177,10 @@ impl CoordinatorHandle {
 pub async fn start(options: CoordinatorOptions) -> Result<CoordinatorHandle, StartError> {
     let (grpc, grpc_addr) = listen("gRPC", options.listen).await?;
     let (http, http_addr) = listen("HTTP", options.http).await?;
+    let plugins = match &options.plugins {
+        Some(plugins) => Plugins::open(plugins).await?,
+        None => Plugins::none(),
+    };
     // After the addresses: a second coordinator on them is refused without counting as a life.
     let mut store: Box<dyn ControlStore> = match &options.state {
         Some(directory) => Box::new(FileStore::open(directory)?),
@@ -172,13 +190,15 @@ pub async fn start(options: CoordinatorOptions) -> Result<CoordinatorHandle, Sta
     let config = CoordinatorConfig {
         liveness: options.liveness,
         app_lease_ms: options.app_lease_ms,
+        plugins: plugins.names(),
         ..CoordinatorConfig::new(epoch, random_seed())
     };
 
     let (owner, commands) = OwnerHandle::new();
     let (stop_owner, owner_stops) = oneshot::channel();
     let (stop_servers, servers_stop) = watch::channel(());
-    let owner_task = tokio::spawn(Owner::new(CoordinatorMachine::new(config)).run(commands, owner_stops));
+    let owner_task =
+        tokio::spawn(Owner::new(CoordinatorMachine::new(config), plugins).run(commands, owner_stops));
     let grpc_task = tokio::spawn(serve_grpc(grpc, Sessions::new(owner.clone()), servers_stop.clone()));
     let http_task = tokio::spawn(serve_http(http, owner.clone(), servers_stop));
     tracing::info!(%epoch, grpc = %grpc_addr, http = %http_addr, "coordinator started");

@@ -10,7 +10,7 @@ use coordinator::CoordinatorOptions;
 use tokio::signal::unix::{Signal, SignalKind, signal};
 use tracing_subscriber::EnvFilter;
 
-use self::settings::Arguments;
+use self::settings::{Arguments, Role};
 
 /// Something failed.
 const EXIT_FAILED: u8 = 1;
@@ -20,6 +20,9 @@ const EXIT_USAGE: u8 = 2;
 fn main() -> ExitCode {
     // clap exits with 2 by itself.
     let arguments = Arguments::parse();
+    if let Some(Role::PolicyHost { object }) = &arguments.role {
+        return coordinator::policy_host::serve(object);
+    }
     let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new("info"));
     tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).init();
     let options = match settings::options(arguments) {

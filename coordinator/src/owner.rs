@@ -16,6 +16,8 @@ use tokio::{
 };
 use tonic::Status;
 
+use crate::plugins::{Answered, Plugins};
+
 /// Commands that wait for the owner; a full queue holds the peers' messages back in their connections.
 pub(crate) const QUEUED_COMMANDS: usize = 1_024;
 /// Messages that wait to be sent to one peer; a peer that lets this many gather is closed.
@@ -59,6 +61,7 @@ impl<M> Peer<M> {
 /// Owns the machine until every handle of the command queue is dropped.
 pub(crate) struct Owner {
     machine: CoordinatorMachine,
+    plugins: Plugins,
     /// The machine's time zero.
     origin: time::Instant,
     apps: HashMap<LinkId, Peer<CoordinatorToApp>>,
@@ -66,8 +69,8 @@ pub(crate) struct Owner {
 }
 
 impl Owner {
-    pub(crate) fn new(machine: CoordinatorMachine) -> Self {
-        Self { machine, origin: time::Instant::now(), apps: HashMap::new(), nodes: HashMap::new() }
+    pub(crate) fn new(machine: CoordinatorMachine, plugins: Plugins) -> Self {
+        Self { machine, plugins, origin: time::Instant::now(), apps: HashMap::new(), nodes: HashMap::new() }
     }
 
     /// Runs until `stop` is told or dropped.
@@ -78,6 +81,7 @@ impl Owner {
     ) {
         let mut burst = Vec::with_capacity(BURST_COMMANDS);
         loop {
+            let mut answered = None;
             let wake = self.machine.poll_timeout().map(|at| self.origin + Duration::from_nanos(at.0));
             tokio::select! {
                 taken = commands.recv_many(&mut burst, BURST_COMMANDS) => {
@@ -85,10 +89,14 @@ impl Owner {
                         return;
                     }
                 }
+                answer = self.plugins.answered() => answered = Some(answer),
                 () = time::sleep_until(wake.unwrap_or(self.origin)), if wake.is_some() => {}
                 _ = &mut stop => return,
             }
             let now = Instant::ZERO.after(self.origin.elapsed());
+            if let Some(Answered { question, answer }) = answered {
+                self.machine.handle(now, Event::PolicyAnswered { question, answer });
+            }
             for command in burst.drain(..) {
                 self.take(now, command);
             }
@@ -145,9 +153,10 @@ impl Owner {
                 Effect::ToNode { link, message } => {
                     (link, self.nodes.get(&link).is_none_or(|peer| peer.tell(message)))
                 }
-                Effect::AskPolicy { id, .. } => {
-                    let answer = Err("this coordinator has no plug-in host".to_owned());
-                    self.machine.handle(now, Event::PolicyAnswered { question: id, answer });
+                Effect::AskPolicy { id, plugin, question } => {
+                    if let Err(reason) = self.plugins.ask(id, &plugin, question) {
+                        self.machine.handle(now, Event::PolicyAnswered { question: id, answer: Err(reason) });
+                    }
                     continue;
                 }
                 Effect::Close { link } => {
@@ -226,7 +235,7 @@ mod tests {
         let (owner, commands) = OwnerHandle::new();
         let (_stop, stopped) = oneshot::channel();
         let machine = CoordinatorMachine::new(CoordinatorConfig::new(Epoch(1), 7));
-        tokio::spawn(Owner::new(machine).run(commands, stopped));
+        tokio::spawn(Owner::new(machine, Plugins::none()).run(commands, stopped));
         let open = |link, capacity| {
             let (outbound, outgoing) = mpsc::channel(capacity);
             let (alive, ended) = oneshot::channel();
@@ -278,7 +287,7 @@ mod tests {
         let (owner, commands) = OwnerHandle::new();
         let (stop, stopped) = oneshot::channel();
         let machine = CoordinatorMachine::new(CoordinatorConfig::new(Epoch(1), 7));
-        let task = tokio::spawn(Owner::new(machine).run(commands, stopped));
+        let task = tokio::spawn(Owner::new(machine, Plugins::none()).run(commands, stopped));
         assert_eq!(owner.drain(NodeId(1)).await, Some(false), "no such node");
         drop(stop);
         task.await.unwrap();

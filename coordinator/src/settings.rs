@@ -1,19 +1,22 @@
 //! Settings of the binary: config file, then environment, then flags, each overruling the one before.
 
 use std::{
-    fs,
+    env, fs,
     net::{SocketAddr, ToSocketAddrs as _},
     path::{Path, PathBuf},
 };
 
 use anyhow::{Context as _, bail, ensure};
-use clap::{Parser, ValueEnum};
-use coordinator::CoordinatorOptions;
+use clap::{Parser, Subcommand, ValueEnum};
+use coordinator::{CoordinatorOptions, plugins::PluginOptions};
 use farm_core::message::Liveness;
 use serde::Deserialize;
 
 /// Largest config file that is read, in bytes.
 const MAX_CONFIG_BYTES: u64 = 1 << 20;
+
+/// The folder of plug-in policies; overrules the config file's `plugins`.
+const PLUGINS_VARIABLE: &str = "GLEANER_PLUGINS";
 
 /// Registers applications and worker nodes, and plans their jobs.
 ///
@@ -47,6 +50,19 @@ pub(crate) struct Arguments {
         value_parser = clap::builder::BoolishValueParser::new()
     )]
     insecure: Option<bool>,
+    #[command(subcommand)]
+    pub(crate) role: Option<Role>,
+}
+
+/// What the executable is besides the coordinator.
+#[derive(Debug, Subcommand)]
+pub(crate) enum Role {
+    /// The process that a plug-in runs in; started by the coordinator.
+    #[command(hide = true)]
+    PolicyHost {
+        /// The shared object.
+        object: PathBuf,
+    },
 }
 
 /// Ready-made timings.
@@ -79,6 +95,8 @@ struct ConfigFile {
     insecure: Option<bool>,
     /// How long a vanished application keeps its jobs, in milliseconds.
     app_lease_ms: Option<u64>,
+    /// The folder of plug-in policies.
+    plugins: Option<PathBuf>,
     #[serde(default)]
     liveness: LivenessTable,
 }
@@ -109,13 +127,21 @@ pub(crate) fn options(arguments: Arguments) -> anyhow::Result<CoordinatorOptions
             );
         }
     }
+    let plugins = env::var_os(PLUGINS_VARIABLE).map(PathBuf::from).or(file.plugins);
     Ok(CoordinatorOptions {
         listen,
         http,
         state: arguments.state.or(file.state),
         liveness: liveness(arguments.liveness, &file.liveness)?,
         app_lease_ms: file.app_lease_ms.unwrap_or(defaults.app_lease_ms),
+        plugins: plugins.map(hosted_here).transpose()?,
     })
+}
+
+/// Plug-ins run in further processes of this executable.
+fn hosted_here(folder: PathBuf) -> anyhow::Result<PluginOptions> {
+    let host = env::current_exe().context("plugins: the system does not say where this executable is")?;
+    Ok(PluginOptions::new(folder, host))
 }
 
 fn read_config(path: &Path) -> anyhow::Result<ConfigFile> {
