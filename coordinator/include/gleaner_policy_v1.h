@@ -39,8 +39,11 @@ extern "C" {
 
 /* A job that wants a place. 16 bytes. */
 typedef struct gleaner_job_v1 {
-    /* Estimated work: nanoseconds on a device of speed 1.0 if the application said so, else in a unit of the batch's own. */
-    uint64_t load_ns;
+    /*
+     * Estimated work, above zero: nanoseconds on a device of speed 1.0 if the application said so, else in a unit of the
+     * batch's own.
+     */
+    double load;
     /* Its index in the task: the same job of the application's next task has the same one. */
     uint32_t index;
     /* Zero. */
@@ -53,8 +56,8 @@ typedef struct gleaner_device_v1 {
     double free_at_ns;
     /* Nanoseconds that one unit of load takes there; above zero. */
     double time_per_load;
-    /* Time to bring what it lacks of the batch's data, in nanoseconds; zero if it has all of it. */
-    double fetch_ns;
+    /* When what it lacks of the batch's data can be there, in nanoseconds from now; zero if it has all of it. */
+    double ready_at_ns;
     /* Its node: devices with the same number are in one machine. Says nothing else. */
     uint64_t node;
     /* Its index in the node. */

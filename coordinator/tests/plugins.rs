@@ -90,12 +90,14 @@ fn question(jobs: u32, speeds: &[f64]) -> Question {
         device: DeviceIndex(0),
         free_at_ns: 0.0,
         time_per_load: 1.0 / speed,
-        fetch_ns: 0.0,
+        ready_at_ns: 0.0,
     });
     Question {
         app: AppId(1),
         task: TaskId(2),
-        jobs: (0..jobs).map(|index| QuestionJob { index: JobIndex(index), load_ns: 10 }).collect(),
+        jobs: (0..jobs)
+            .map(|index| QuestionJob { index: JobIndex(index), load: 10.0, avoid: None })
+            .collect(),
         devices: devices.collect(),
     }
 }
@@ -157,7 +159,7 @@ async fn a_wrong_answer_is_none_and_the_next_one_counts() {
         ),
         ("for (int i = 0; i < 3; i++) choices[i].job = 0; return 0;", "more than the 2 choices"),
         ("return -3;", "returned -3"),
-        ("raise(11);", "signal 11"),
+        ("raise(9);", "signal 9"),
         ("*(volatile int *)0 = 1;", "signal 11"),
         ("abort();", "signal 6"),
         ("exit(0);", "exit code 0"),

@@ -13,7 +13,7 @@ pub(super) const NONE: u32 = u32::MAX;
 #[repr(C)]
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Job {
-    pub(super) load_ns: u64,
+    pub(super) load: f64,
     pub(super) index: u32,
     pub(super) reserved: u32,
 }
@@ -24,7 +24,7 @@ pub(super) struct Job {
 pub(super) struct Device {
     pub(super) free_at_ns: f64,
     pub(super) time_per_load: f64,
-    pub(super) fetch_ns: f64,
+    pub(super) ready_at_ns: f64,
     pub(super) node: u64,
     pub(super) device: u32,
     pub(super) reserved: u32,
@@ -85,8 +85,17 @@ mod tests {
 
     fn layouts() -> [Layout; 5] {
         [
-            layout!("gleaner_job_v1", Job, load_ns, index, reserved),
-            layout!("gleaner_device_v1", Device, free_at_ns, time_per_load, fetch_ns, node, device, reserved),
+            layout!("gleaner_job_v1", Job, load, index, reserved),
+            layout!(
+                "gleaner_device_v1",
+                Device,
+                free_at_ns,
+                time_per_load,
+                ready_at_ns,
+                node,
+                device,
+                reserved
+            ),
             layout!("gleaner_batch_v1", Batch, app, jobs, devices, job_count, device_count, task, reserved),
             layout!("gleaner_choice_v1", Choice, job, device),
             layout!("struct gleaner_policy_v1", Policy, abi_version, struct_size, about, place),

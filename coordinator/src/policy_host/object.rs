@@ -127,7 +127,7 @@ impl PolicyObject {
         let jobs: Vec<abi::Job> = question
             .jobs
             .iter()
-            .map(|job| abi::Job { load_ns: job.load_ns, index: job.index.0, reserved: 0 })
+            .map(|job| abi::Job { load: job.load, index: job.index.0, reserved: 0 })
             .collect();
         let devices: Vec<abi::Device> = question
             .devices
@@ -135,7 +135,7 @@ impl PolicyObject {
             .map(|device| abi::Device {
                 free_at_ns: device.free_at_ns,
                 time_per_load: device.time_per_load,
-                fetch_ns: device.fetch_ns,
+                ready_at_ns: device.ready_at_ns,
                 node: device.node.0,
                 device: device.device.0.into(),
                 reserved: 0,
