@@ -10,6 +10,7 @@ mod failure;
 mod output;
 mod progress;
 mod running;
+mod timeline;
 
 use std::process::ExitCode;
 
@@ -47,6 +48,7 @@ fn run(cli: &Cli) -> Result<(), Failure> {
             Verb::Mi(arguments) => Box::pin(command::mi::run(arguments, coordinator)).await,
             Verb::Scene(arguments) => command::scene::run(arguments),
             Verb::Status(arguments) => command::status::run(arguments, coordinator, cli.output).await,
+            Verb::Timeline(arguments) => command::timeline::run(arguments, coordinator, cli.output).await,
             Verb::Node(verb) => command::node::run(verb, coordinator).await,
             Verb::Bench(arguments) => {
                 Box::pin(bench::run(arguments.name, arguments.output.unwrap_or(cli.output))).await
