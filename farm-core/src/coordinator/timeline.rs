@@ -380,3 +380,49 @@ impl Life {
         near.map(|window| window.least_delay_ns).min().unwrap_or(0)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn life(reports: &[(u64, u64)]) -> Life {
+        let node = TimelineNode { node: NodeId(1), name: String::new(), devices: Vec::new() };
+        let mut record = Record { newest: BTreeMap::from([(NodeId(1), LifeId(0))]), ..Record::default() };
+        record.lives.insert(LifeId(0), Life { session: NodeSession(1), node, windows: VecDeque::new() });
+        for &(sent_at, received) in reports {
+            record.report_came(Instant(received), NodeId(1), Instant(sent_at));
+        }
+        record.lives.remove(&LifeId(0)).expect("put there")
+    }
+
+    #[test]
+    fn the_least_delay_of_a_window_places_its_times() {
+        // The node's clock is 1,000 behind; its reports are 50, 3 and 20 on the way.
+        let life = life(&[(100, 1_150), (200, 1_203), (300, 1_320)]);
+        assert_eq!(life.delay_ns(Instant(250)), 1_003);
+        assert_eq!(life.delay_ns(Instant(50)), 1_003, "before the first report too");
+    }
+
+    #[test]
+    fn a_node_may_be_ahead_of_the_coordinator() {
+        assert_eq!(life(&[(1_000_000, 10)]).delay_ns(Instant(1_000_000)), -999_990);
+    }
+
+    #[test]
+    fn clocks_that_run_apart_are_followed() {
+        // Two minutes of each minute's reports 6 ms later than before: 100 ppm.
+        let reports: Vec<(u64, u64)> =
+            (0..10).map(|minute| (minute * WINDOW_NS, minute * (WINDOW_NS + 6_000_000))).collect();
+        let life = life(&reports);
+        assert_eq!(life.windows.len(), 10);
+        let error = life.delay_ns(Instant(9 * WINDOW_NS)) - 9 * 6_000_000;
+        assert!((-6_000_000..=0).contains(&error), "{error} ns: within one window's drift");
+    }
+
+    #[test]
+    fn windows_are_bounded() {
+        let reports: Vec<(u64, u64)> =
+            (0..2 * MAX_WINDOWS as u64).map(|minute| (minute * WINDOW_NS, minute * WINDOW_NS)).collect();
+        assert_eq!(life(&reports).windows.len(), MAX_WINDOWS);
+    }
+}
