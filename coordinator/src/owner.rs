@@ -5,7 +5,10 @@
 use std::{collections::HashMap, time::Duration};
 
 use farm_core::{
-    coordinator::{CoordinatorMachine, Effect, Event, FarmStatus},
+    coordinator::{
+        CoordinatorMachine, Effect, Event, FarmStatus,
+        timeline::{Timeline, TimelineQuery},
+    },
     id::{LinkId, NodeId},
     message::{AppToCoordinator, CoordinatorToApp, CoordinatorToNode, NodeToCoordinator},
     time::Instant,
@@ -41,6 +44,8 @@ pub(crate) enum Command {
     Status(oneshot::Sender<FarmStatus>),
     /// Asks a node to leave; answered with whether there is such a node.
     Drain(NodeId, oneshot::Sender<bool>),
+    /// Asks what ran when and where.
+    Timeline(TimelineQuery, oneshot::Sender<Timeline>),
 }
 
 /// The owner's end of one connection. Dropping it ends the session after what is queued.
@@ -133,6 +138,7 @@ impl Owner {
             }
             // An asker that went away needs no answer.
             Command::Status(answer) => drop(answer.send(self.machine.status())),
+            Command::Timeline(query, answer) => drop(answer.send(self.machine.timeline(query))),
             Command::Drain(node, answer) => {
                 let known = self.machine.status().nodes.iter().any(|known| known.node == node);
                 if known {
@@ -212,6 +218,13 @@ impl OwnerHandle {
         let (answer, known) = oneshot::channel();
         self.0.send(Command::Drain(node, answer)).await.ok()?;
         known.await.ok()
+    }
+
+    /// `None` once the owner has stopped.
+    pub(crate) async fn timeline(&self, query: TimelineQuery) -> Option<Timeline> {
+        let (answer, timeline) = oneshot::channel();
+        self.0.send(Command::Timeline(query, answer)).await.ok()?;
+        timeline.await.ok()
     }
 
     /// Waits until the owner has stopped.

@@ -1,7 +1,7 @@
 //! The gRPC services: each session is a reader that feeds the owner, and a stream that the owner fills.
 
 use std::{
-    fmt,
+    fmt, iter,
     sync::{
         Arc,
         atomic::{AtomicU64, Ordering},
@@ -10,6 +10,7 @@ use std::{
 };
 
 use farm_core::{
+    coordinator::timeline::Timeline,
     id::{LinkId, NodeId},
     message::{AppToCoordinator, CoordinatorToApp, CoordinatorToNode, NodeToCoordinator},
 };
@@ -27,6 +28,9 @@ use crate::owner::{Command, OwnerHandle, Peer, QUEUED_MESSAGES};
 const MAX_SESSIONS: usize = 4_096;
 /// A session whose first message does not come within this time is closed.
 const FIRST_MESSAGE_TIMEOUT: Duration = Duration::from_secs(10);
+
+/// Segments in one part of a timeline, about half a megabyte: far below the message cap.
+const PART_SEGMENTS: usize = 8_192;
 
 /// All three services; cloneable.
 #[derive(Clone, Debug)]
@@ -161,6 +165,8 @@ impl Nodes for Sessions {
 
 #[tonic::async_trait]
 impl Admin for Sessions {
+    type TimelineStream = Answers<v1::TimelinePart>;
+
     async fn status(&self, _request: Request<v1::StatusRequest>) -> Result<Response<v1::FarmStatus>, Status> {
         let status = self.owner.status().await.ok_or_else(stopping)?;
         Ok(Response::new(status.into()))
@@ -173,6 +179,27 @@ impl Admin for Sessions {
             false => Err(Status::not_found(format!("{node} is not registered"))),
         }
     }
+
+    async fn timeline(
+        &self,
+        request: Request<v1::TimelineRequest>,
+    ) -> Result<Response<Self::TimelineStream>, Status> {
+        let timeline = self.owner.timeline(request.into_inner().into()).await.ok_or_else(stopping)?;
+        Ok(Response::new(Box::pin(tokio_stream::iter(timeline_parts(timeline)).map(Ok))))
+    }
+}
+
+/// The head, then the segments; each part is made when the connection has room for it.
+fn timeline_parts(timeline: Timeline) -> impl Iterator<Item = v1::TimelinePart> + Send {
+    use v1::timeline_part::Part;
+    let Timeline { head, segments } = timeline;
+    let parts = segments.len().div_ceil(PART_SEGMENTS);
+    let segments = (0..parts).map(move |part| {
+        let from = part * PART_SEGMENTS;
+        let to = segments.len().min(from + PART_SEGMENTS);
+        Part::Segments(segments[from..to].into())
+    });
+    iter::once(Part::Head(head.into())).chain(segments).map(|part| v1::TimelinePart { part: Some(part) })
 }
 
 fn stopping() -> Status {

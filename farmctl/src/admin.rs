@@ -1,6 +1,12 @@
 //! What `farmctl` asks a coordinator as an operator.
 
-use farm_core::{coordinator::FarmStatus, id::NodeId};
+use farm_core::{
+    coordinator::{
+        FarmStatus,
+        timeline::{Timeline, TimelineQuery},
+    },
+    id::NodeId,
+};
 use proto::control::{self, SessionError};
 
 use crate::failure::Failure;
@@ -23,6 +29,11 @@ impl<'a> Admin<'a> {
     /// How the farm stands.
     pub(crate) async fn status(&self) -> Result<FarmStatus, Failure> {
         control::status(self.address).await.map_err(failure)
+    }
+
+    /// What ran when and where.
+    pub(crate) async fn timeline(&self, query: TimelineQuery) -> Result<Timeline, Failure> {
+        control::timeline(self.address, query).await.map_err(failure)
     }
 
     /// Lets a node finish and leave.

@@ -62,6 +62,8 @@ pub(crate) enum Verb {
     Scene(SceneArgs),
     /// Show the farm: nodes, devices, queues, applications.
     Status(StatusArgs),
+    /// Show what ran when and where: a table, a picture, or a trace for ui.perfetto.dev.
+    Timeline(TimelineArgs),
     /// Look after nodes.
     #[command(subcommand)]
     Node(NodeVerb),
@@ -180,6 +182,41 @@ pub(crate) struct StatusArgs {
     /// Print again every INTERVAL until interrupted.
     #[arg(long, value_name = "INTERVAL", num_args = 0..=1, default_missing_value = "1s", value_parser = duration)]
     pub watch: Option<Duration>,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct TimelineArgs {
+    /// An application or one of its tasks: app-3, 3, app-3/task-0, 3/0, @last or @all.
+    #[arg(default_value = "@last")]
+    pub task: String,
+    /// How it is shown; json or table as before the verb without it.
+    #[arg(short = 'o', long, value_enum, id = "timeline_format")]
+    pub output: Option<TimelineFormat>,
+    /// Where it goes; stdout without it.
+    #[arg(long, value_name = "FILE")]
+    pub out: Option<PathBuf>,
+}
+
+/// How a timeline is shown.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub(crate) enum TimelineFormat {
+    /// A line for each device.
+    Table,
+    /// A picture, as the thesis draws it.
+    Svg,
+    /// Trace events, for ui.perfetto.dev.
+    Perfetto,
+    /// Every segment.
+    Json,
+}
+
+impl From<Format> for TimelineFormat {
+    fn from(format: Format) -> Self {
+        match format {
+            Format::Table | Format::Wide => Self::Table,
+            Format::Json | Format::Ndjson => Self::Json,
+        }
+    }
 }
 
 #[derive(Debug, Subcommand)]

@@ -11,6 +11,7 @@ mod output;
 mod process_farm;
 mod progress;
 mod running;
+mod timeline;
 
 use std::process::ExitCode;
 
@@ -48,6 +49,7 @@ fn run(cli: &Cli) -> Result<(), Failure> {
             Verb::Mi(arguments) => Box::pin(command::mi::run(arguments, coordinator)).await,
             Verb::Scene(arguments) => command::scene::run(arguments),
             Verb::Status(arguments) => command::status::run(arguments, coordinator, cli.output).await,
+            Verb::Timeline(arguments) => command::timeline::run(arguments, coordinator, cli.output).await,
             Verb::Node(verb) => command::node::run(verb, coordinator).await,
             Verb::Bench(arguments) => {
                 Box::pin(bench::run(arguments, arguments.output.unwrap_or(cli.output))).await

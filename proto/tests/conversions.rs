@@ -5,7 +5,10 @@
 use std::fmt;
 
 use farm_core::{
-    coordinator::{AppStatus, DeviceStatus, FarmStatus, NodeState, NodeStatus},
+    coordinator::{
+        AppStatus, DeviceStatus, FarmStatus, NodeState, NodeStatus,
+        timeline::{Migration, Outcome, Segment, TimelineApp, TimelineHead, TimelineNode},
+    },
     device::{DeviceInfo, DeviceKind, Features, Limits, Requirements, SimulatedDevices},
     id::{
         AppId, AppIncarnation, Attempt, BatchId, ContentHash, DeviceIndex, Epoch, JobAttempt, JobId,
@@ -323,7 +326,58 @@ fn farm_status() -> impl Strategy<Value = FarmStatus> {
     })
 }
 
+fn segments() -> impl Strategy<Value = Vec<Segment>> {
+    let from = any::<u16>().prop_map(DeviceIndex);
+    let migration = option::of(prop_oneof![
+        from.clone().prop_map(|device| Migration::Local { device }),
+        (any::<u64>(), from).prop_map(|(node, device)| Migration::Global { node: NodeId(node), device }),
+    ]);
+    let outcome = prop::sample::select(vec![Outcome::Completed, Outcome::Failed]);
+    let rest = (any::<(u64, u16, [u64; 5])>(), outcome, migration);
+    (attempts(), vec(rest, 40)).prop_map(|(jobs, rest)| {
+        let segments =
+            jobs.into_iter().zip(rest).map(|(job, ((node, device, times), outcome, migration))| Segment {
+                job,
+                node: NodeId(node),
+                device: DeviceIndex(device),
+                scheduled_at: Instant(times[0]),
+                staged_at: Instant(times[1]),
+                started_at: Instant(times[2]),
+                ended_at: Instant(times[3]),
+                device_time_ns: times[4],
+                outcome,
+                migration,
+            });
+        segments.collect()
+    })
+}
+
+fn timeline_head() -> impl Strategy<Value = TimelineHead> {
+    let node = (any::<u64>(), "\\PC{0,20}", vec("\\PC{0,20}", 0..4))
+        .prop_map(|(node, name, devices)| TimelineNode { node: NodeId(node), name, devices });
+    let app = (any::<u64>(), "\\PC{0,20}", vec(any::<(u32, u64)>(), 0..4)).prop_map(|(app, name, tasks)| {
+        let tasks = tasks.into_iter().map(|(task, count)| (TaskId(task), count)).collect();
+        TimelineApp { app: AppId(app), name, tasks }
+    });
+    (vec(node, 0..4), vec(app, 0..4), any::<(u64, u64)>()).prop_map(
+        |(nodes, apps, (dropped_segments, omitted_segments))| TimelineHead {
+            nodes,
+            apps,
+            dropped_segments,
+            omitted_segments,
+        },
+    )
+}
+
 proptest! {
+    #[test]
+    fn timelines_come_back(head in timeline_head(), segments in segments()) {
+        prop_assert_eq!(over_the_wire::<_, v1::TimelineHead>(head.clone()), head);
+        let bytes = v1::TimelineSegments::from(segments.as_slice()).encode_to_vec();
+        let wire = v1::TimelineSegments::decode(bytes.as_slice()).unwrap();
+        prop_assert_eq!(Vec::<Segment>::try_from(wire).unwrap(), segments);
+    }
+
     #[test]
     fn app_to_coordinator_comes_back(message in app_to_coordinator()) {
         prop_assert_eq!(over_the_wire::<_, v1::AppToCoordinator>(message.clone()), message);
@@ -356,6 +410,8 @@ proptest! {
         let _ = v1::CoordinatorToApp::decode(&bytes[..]).map(CoordinatorToApp::try_from);
         let _ = v1::NodeToCoordinator::decode(&bytes[..]).map(NodeToCoordinator::try_from);
         let _ = v1::CoordinatorToNode::decode(&bytes[..]).map(CoordinatorToNode::try_from);
+        let _ = v1::TimelineHead::decode(&bytes[..]).map(TimelineHead::try_from);
+        let _ = v1::TimelineSegments::decode(&bytes[..]).map(Vec::<Segment>::try_from);
         let _ = v1::FarmStatus::decode(&bytes[..]).map(FarmStatus::try_from);
     }
 

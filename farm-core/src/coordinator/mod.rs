@@ -5,7 +5,7 @@
 //!
 //! Split by event family: `registry` (who is there), `placement` (where jobs go, by a `policy`; `consult` asks plug-ins),
 //! `report` (what ended), `replan` (what was lost), `steal` (what moves between nodes), `speculate` (what runs twice at the tail), `lease` (who is silent), `status`
-//! (what operators see). `model` holds the state they share, `rates` what devices are worth.
+//! (what operators see), `timeline` (what ran when and where). `model` holds the state they share, `rates` what devices are worth.
 
 mod consult;
 mod invariants;
@@ -20,6 +20,7 @@ mod report;
 mod speculate;
 mod status;
 mod steal;
+pub mod timeline;
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
@@ -31,6 +32,7 @@ use self::{
     policy::{Choice, History, Question, QuestionId},
     rates::Modules,
     steal::{Steal, StealLatency},
+    timeline::Record,
 };
 use crate::{
     device::DeviceKind,
@@ -270,6 +272,7 @@ pub struct CoordinatorMachine {
     /// Attempts beside those that the jobs' states name.
     backups: BTreeMap<JobId, Placement>,
     speculations: u64,
+    timeline: Record,
     effects: VecDeque<Effect>,
 }
 
@@ -305,6 +308,7 @@ impl CoordinatorMachine {
             policy_fallbacks: 0,
             backups: BTreeMap::new(),
             speculations: 0,
+            timeline: Record::default(),
             effects: VecDeque::new(),
         }
     }
@@ -398,7 +402,8 @@ impl CoordinatorMachine {
                 self.consider_speculating(now, node);
                 self.tell_node(node, CoordinatorToNode::HeartbeatAck { sequence });
             }
-            NodeToCoordinator::Report { sent_at: _, executed, delivered } => {
+            NodeToCoordinator::Report { sent_at, executed, delivered } => {
+                self.timeline.report_came(now, node, sent_at);
                 self.reported(now, node, executed, &delivered)
             }
             NodeToCoordinator::DeviceLost { device, reason } => self.device_lost(node, device, &reason),

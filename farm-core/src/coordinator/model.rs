@@ -122,6 +122,8 @@ pub(super) struct Placement {
     pub(super) device: DeviceIndex,
     pub(super) attempt: Attempt,
     pub(super) planned_at: Instant,
+    /// Node and device that a global steal took it from.
+    pub(super) stolen_from: Option<(NodeId, DeviceIndex)>,
     pub(super) load: Load,
     /// The steal that asks its node to give it up.
     pub(super) retracting: Option<StealId>,

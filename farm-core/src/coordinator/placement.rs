@@ -251,6 +251,7 @@ impl CoordinatorMachine {
                 device: share.device,
                 attempt,
                 planned_at: now,
+                stolen_from: None,
                 load,
                 retracting: None,
             });

@@ -55,6 +55,7 @@ impl CoordinatorMachine {
             return;
         }
         let id = self.node_id(&hello.name);
+        self.timeline.node_known(id, &hello);
         let same_session = self.nodes.get(&id).map(|node| node.session == hello.session);
         match same_session {
             Some(true) => {
@@ -123,6 +124,7 @@ impl CoordinatorMachine {
     pub(super) fn app_leaves(&mut self, id: AppId) {
         self.drop_backups_of(id);
         let Some(app) = self.apps.remove(&id) else { return };
+        self.timeline.app_leaves(id, &app);
         for (key, job) in app.jobs {
             self.release(id, key, job.state);
         }
@@ -235,6 +237,7 @@ impl CoordinatorMachine {
             device_time_ns: 0,
         };
         tracing::info!(app = %id, name = app.name, "application registered");
+        self.timeline.app_known(id, &app.name);
         self.apps.insert(id, app);
         self.links.insert(link, Peer::App(id));
         self.welcome_app(now, id);

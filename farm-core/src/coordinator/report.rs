@@ -45,6 +45,7 @@ impl CoordinatorMachine {
     }
 
     fn executed(&mut self, now: Instant, node: NodeId, ended: Executed) {
+        self.trace(node, &ended);
         let Executed { job: JobAttempt { job: id, attempt }, device, device_time_ns, trace: _, failure } =
             ended;
         let job = JobAttempt { job: id, attempt };

@@ -138,8 +138,15 @@ impl CoordinatorMachine {
         self.next_attempt += 1;
         let id = straggler.job;
         let Some(node) = self.nodes.get_mut(&helper) else { return };
-        let place =
-            Placement { node: helper, device, attempt, planned_at: now, retracting: None, ..straggler.place };
+        let place = Placement {
+            node: helper,
+            device,
+            attempt,
+            planned_at: now,
+            stolen_from: None,
+            retracting: None,
+            ..straggler.place
+        };
         node.jobs.insert(id);
         if let Some(device) = node.device_mut(device) {
             device.add_load(now, place.load);

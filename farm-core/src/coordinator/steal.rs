@@ -408,8 +408,15 @@ impl CoordinatorMachine {
         self.next_attempt += 1;
         let Some(job) = self.job_mut(id) else { return false };
         job.stolen_from.push(from.node);
-        let place =
-            Placement { node: steal.thief, device, attempt, planned_at: now, retracting: None, ..from };
+        let place = Placement {
+            node: steal.thief,
+            device,
+            attempt,
+            planned_at: now,
+            stolen_from: Some((from.node, from.device)),
+            retracting: None,
+            ..from
+        };
         job.state = JobState::Placed(place);
         let batch = self.apps.get(&id.app).and_then(|app| app.batches.get(&self.job(id)?.batch));
         let contents = batch.map_or_else(Vec::new, |batch| batch.contents.clone());

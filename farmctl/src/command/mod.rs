@@ -5,5 +5,6 @@ pub(crate) mod node;
 pub(crate) mod render;
 pub(crate) mod scene;
 pub(crate) mod status;
+pub(crate) mod timeline;
 pub(crate) mod up;
 pub(crate) mod version;

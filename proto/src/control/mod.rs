@@ -29,7 +29,7 @@ pub use self::{
     },
     session::{
         Heard, QUEUED_MESSAGES, Session, SessionError, SessionReceiver, SessionSender, connect_app,
-        connect_node, drain, status,
+        connect_node, drain, status, timeline,
     },
     transport::{
         ADMIN_TIMEOUT, MAX_MESSAGE_BYTES, admin_server, apps_server, incoming, nodes_server, server,

@@ -3,7 +3,10 @@
 use std::{error::Error, fmt};
 
 use farm_core::{
-    coordinator::FarmStatus,
+    coordinator::{
+        FarmStatus,
+        timeline::{MAX_SEGMENTS, Segment, Timeline, TimelineQuery},
+    },
     id::NodeId,
     message::{AppToCoordinator, CoordinatorToApp, CoordinatorToNode, NodeToCoordinator},
 };
@@ -190,6 +193,34 @@ pub async fn drain(coordinator: &str, node: NodeId) -> Result<(), SessionError> 
     let mut client = admin(coordinator).await?;
     within_timeout(coordinator, client.drain(Request::new(v1::DrainRequest { node: node.0 }))).await?;
     Ok(())
+}
+
+/// Asks what ran when and where.
+///
+/// # Errors
+/// Nobody answers, the answer breaks off, or it is more than the record can hold.
+pub async fn timeline(coordinator: &str, query: TimelineQuery) -> Result<Timeline, SessionError> {
+    let mut client = admin(coordinator).await?;
+    let request = Request::new(v1::TimelineRequest::from(query));
+    let mut parts = within_timeout(coordinator, client.timeline(request)).await?.into_inner();
+    let mut timeline = Timeline::default();
+    let mut headed = false;
+    while let Some(part) = within_timeout(coordinator, parts.message()).await? {
+        use v1::timeline_part::Part;
+        match part.part.ok_or(WireError::Missing { field: "TimelinePart.part" })? {
+            Part::Head(head) => (timeline.head, headed) = (head.try_into()?, true),
+            Part::Segments(segments) => {
+                let mut segments: Vec<Segment> = segments.try_into()?;
+                timeline.segments.append(&mut segments);
+            }
+        }
+        let count = timeline.segments.len();
+        if count > MAX_SEGMENTS {
+            let too_many = WireError::TooMany { field: "TimelinePart.segments", count, cap: MAX_SEGMENTS };
+            return Err(too_many.into());
+        }
+    }
+    if headed { Ok(timeline) } else { Err(WireError::Missing { field: "TimelinePart.head" }.into()) }
 }
 
 async fn admin(coordinator: &str) -> Result<AdminClient<Channel>, SessionError> {

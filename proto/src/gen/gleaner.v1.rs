@@ -356,6 +356,132 @@ pub struct FarmStatus {
     #[prost(uint64, tag = "8")]
     pub policy_fallbacks: u64,
 }
+/// Asks what ran when and where.
+#[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct TimelineRequest {
+    /// Of one application; absent for all.
+    #[prost(uint64, optional, tag = "1")]
+    pub app: ::core::option::Option<u64>,
+    /// Of one task of it; absent for all.
+    #[prost(uint32, optional, tag = "2")]
+    pub task: ::core::option::Option<u32>,
+    /// The newest so many segments; the record holds 131,072 at most.
+    #[prost(uint32, tag = "3")]
+    pub max_segments: u32,
+}
+/// A part of the answer.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct TimelinePart {
+    /// One of these.
+    #[prost(oneof = "timeline_part::Part", tags = "1, 2")]
+    pub part: ::core::option::Option<timeline_part::Part>,
+}
+/// Nested message and enum types in `TimelinePart`.
+pub mod timeline_part {
+    /// One of these.
+    #[derive(Clone, PartialEq, ::prost::Oneof)]
+    pub enum Part {
+        /// First, and once.
+        #[prost(message, tag = "1")]
+        Head(super::TimelineHead),
+        /// The rest, in the order in which they were reported.
+        #[prost(message, tag = "2")]
+        Segments(super::TimelineSegments),
+    }
+}
+/// Names and counts.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct TimelineHead {
+    /// By id: the nodes of the segments, and those that are there.
+    #[prost(message, repeated, tag = "1")]
+    pub nodes: ::prost::alloc::vec::Vec<TimelineNode>,
+    /// Every application in the record, by id.
+    #[prost(message, repeated, tag = "2")]
+    pub apps: ::prost::alloc::vec::Vec<TimelineApp>,
+    /// Older segments that the record had no room for.
+    #[prost(uint64, tag = "3")]
+    pub dropped_segments: u64,
+    /// Older segments that were asked for and are more than max_segments.
+    #[prost(uint64, tag = "4")]
+    pub omitted_segments: u64,
+}
+/// A node; it may have left.
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct TimelineNode {
+    /// The node.
+    #[prost(uint64, tag = "1")]
+    pub node: u64,
+    /// For people.
+    #[prost(string, tag = "2")]
+    pub name: ::prost::alloc::string::String,
+    /// Its devices' names, by index.
+    #[prost(string, repeated, tag = "3")]
+    pub devices: ::prost::alloc::vec::Vec<::prost::alloc::string::String>,
+}
+/// An application; it may have left.
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct TimelineApp {
+    /// The application.
+    #[prost(uint64, tag = "1")]
+    pub app: u64,
+    /// For people.
+    #[prost(string, tag = "2")]
+    pub name: ::prost::alloc::string::String,
+    /// Its tasks with segments.
+    #[prost(uint32, repeated, tag = "3")]
+    pub tasks: ::prost::alloc::vec::Vec<u32>,
+    /// How many of each.
+    #[prost(uint64, repeated, tag = "4")]
+    pub task_segments: ::prost::alloc::vec::Vec<u64>,
+}
+/// Ended attempts, as columns of one length.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct TimelineSegments {
+    /// Which.
+    #[prost(message, optional, tag = "1")]
+    pub jobs: ::core::option::Option<Attempts>,
+    /// The node of each.
+    #[prost(uint64, repeated, tag = "2")]
+    pub nodes: ::prost::alloc::vec::Vec<u64>,
+    /// The device of each, < 65,536.
+    #[prost(uint32, repeated, tag = "3")]
+    pub devices: ::prost::alloc::vec::Vec<u32>,
+    /// When each was planned, on the coordinator's clock, less the one before it (the first: less zero), in nanoseconds
+    /// modulo 2^64, as all differences here.
+    #[prost(sint64, repeated, tag = "4")]
+    pub scheduled_deltas_ns: ::prost::alloc::vec::Vec<i64>,
+    /// When each was handed to its executor, less when it was planned.
+    #[prost(sint64, repeated, tag = "5")]
+    pub staged_after_ns: ::prost::alloc::vec::Vec<i64>,
+    /// When each began to run, less when it was handed over.
+    #[prost(sint64, repeated, tag = "6")]
+    pub started_after_ns: ::prost::alloc::vec::Vec<i64>,
+    /// When each ended, less when it began.
+    #[prost(sint64, repeated, tag = "7")]
+    pub ended_after_ns: ::prost::alloc::vec::Vec<i64>,
+    /// Measured device time of each, in nanoseconds.
+    #[prost(uint64, repeated, tag = "8")]
+    pub device_time_ns: ::prost::alloc::vec::Vec<u64>,
+    /// Those without a result, by position, increasing.
+    #[prost(uint32, repeated, tag = "9")]
+    pub failed: ::prost::alloc::vec::Vec<u32>,
+    /// Those that were stolen, by position, increasing.
+    #[prost(message, repeated, tag = "10")]
+    pub migrations: ::prost::alloc::vec::Vec<TimelineMigration>,
+}
+/// How an attempt came to a device that it was not planned for at first.
+#[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct TimelineMigration {
+    /// Position of the segment.
+    #[prost(uint32, tag = "1")]
+    pub position: u32,
+    /// The victim; absent for a steal between devices of one node.
+    #[prost(uint64, optional, tag = "2")]
+    pub from_node: ::core::option::Option<u64>,
+    /// The victim's device, < 65,536.
+    #[prost(uint32, tag = "3")]
+    pub from_device: u32,
+}
 /// How a node stands.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]
 #[repr(i32)]
@@ -512,6 +638,30 @@ pub mod admin_client {
             req.extensions_mut().insert(GrpcMethod::new("gleaner.v1.Admin", "Drain"));
             self.inner.unary(req, path, codec).await
         }
+        /// What ran when and where: first the head, then segments in parts.
+        pub async fn timeline(
+            &mut self,
+            request: impl tonic::IntoRequest<super::TimelineRequest>,
+        ) -> std::result::Result<
+            tonic::Response<tonic::codec::Streaming<super::TimelinePart>>,
+            tonic::Status,
+        > {
+            self.inner
+                .ready()
+                .await
+                .map_err(|e| {
+                    tonic::Status::unknown(
+                        format!("Service was not ready: {}", e.into()),
+                    )
+                })?;
+            let codec = tonic_prost::ProstCodec::default();
+            let path = http::uri::PathAndQuery::from_static(
+                "/gleaner.v1.Admin/Timeline",
+            );
+            let mut req = request.into_request();
+            req.extensions_mut().insert(GrpcMethod::new("gleaner.v1.Admin", "Timeline"));
+            self.inner.server_streaming(req, path, codec).await
+        }
     }
 }
 /// Generated server implementations.
@@ -537,6 +687,17 @@ pub mod admin_server {
             &self,
             request: tonic::Request<super::DrainRequest>,
         ) -> std::result::Result<tonic::Response<super::DrainResponse>, tonic::Status>;
+        /// Server streaming response type for the Timeline method.
+        type TimelineStream: tonic::codegen::tokio_stream::Stream<
+                Item = std::result::Result<super::TimelinePart, tonic::Status>,
+            >
+            + std::marker::Send
+            + 'static;
+        /// What ran when and where: first the head, then segments in parts.
+        async fn timeline(
+            &self,
+            request: tonic::Request<super::TimelineRequest>,
+        ) -> std::result::Result<tonic::Response<Self::TimelineStream>, tonic::Status>;
     }
     /// What operators call.
     #[derive(Debug)]
@@ -697,6 +858,52 @@ pub mod admin_server {
                                 max_encoding_message_size,
                             );
                         let res = grpc.unary(method, req).await;
+                        Ok(res)
+                    };
+                    Box::pin(fut)
+                }
+                "/gleaner.v1.Admin/Timeline" => {
+                    #[allow(non_camel_case_types)]
+                    struct TimelineSvc<T: Admin>(pub Arc<T>);
+                    impl<
+                        T: Admin,
+                    > tonic::server::ServerStreamingService<super::TimelineRequest>
+                    for TimelineSvc<T> {
+                        type Response = super::TimelinePart;
+                        type ResponseStream = T::TimelineStream;
+                        type Future = BoxFuture<
+                            tonic::Response<Self::ResponseStream>,
+                            tonic::Status,
+                        >;
+                        fn call(
+                            &mut self,
+                            request: tonic::Request<super::TimelineRequest>,
+                        ) -> Self::Future {
+                            let inner = Arc::clone(&self.0);
+                            let fut = async move {
+                                <T as Admin>::timeline(&inner, request).await
+                            };
+                            Box::pin(fut)
+                        }
+                    }
+                    let accept_compression_encodings = self.accept_compression_encodings;
+                    let send_compression_encodings = self.send_compression_encodings;
+                    let max_decoding_message_size = self.max_decoding_message_size;
+                    let max_encoding_message_size = self.max_encoding_message_size;
+                    let inner = self.inner.clone();
+                    let fut = async move {
+                        let method = TimelineSvc(inner);
+                        let codec = tonic_prost::ProstCodec::default();
+                        let mut grpc = tonic::server::Grpc::new(codec)
+                            .apply_compression_config(
+                                accept_compression_encodings,
+                                send_compression_encodings,
+                            )
+                            .apply_max_message_size_config(
+                                max_decoding_message_size,
+                                max_encoding_message_size,
+                            );
+                        let res = grpc.server_streaming(method, req).await;
                         Ok(res)
                     };
                     Box::pin(fut)

@@ -6,6 +6,7 @@ mod apps;
 mod attempts;
 mod model;
 mod nodes;
+mod timeline;
 
 use farm_core::id::DeviceIndex;
 use thiserror::Error;
