@@ -1,9 +1,12 @@
 //! One coordinator, some workers and some applications, their real machines in one process over a seeded network with
 //! virtual time: nothing is lost, nothing comes twice, and everything ends once the faults do.
 
+#[path = "../src/sim/faults.rs"]
 mod faults;
+#[path = "../src/sim/hosts.rs"]
 mod hosts;
 mod steals;
+#[path = "../src/sim/world.rs"]
 mod world;
 
 use std::time::Duration;
