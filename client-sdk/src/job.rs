@@ -6,7 +6,7 @@ use std::{error::Error, time::Duration};
 use bytes::Bytes;
 use farm_core::{
     id::NodeId,
-    message::{CostNs, JobFailure, Priority},
+    message::{CostNs, JobFailure, LatencyClass, Priority},
     program::{DispatchError, JobProgram},
 };
 use thiserror::Error;
@@ -42,7 +42,13 @@ pub trait Job: Send + 'static {
         CostNs(0)
     }
 
-    /// Order inside the application: larger goes first.
+    /// When the job may take a device. An interactive one goes ahead of batch jobs, and takes the device of one that runs
+    /// at its next launch boundary, as long as its application has not had more than its fair share.
+    fn latency_class(&self) -> LatencyClass {
+        LatencyClass::Batch
+    }
+
+    /// Order inside the application and class: larger goes first.
     fn priority(&self) -> Priority {
         Priority(0)
     }

@@ -2,6 +2,8 @@
 
 use std::time::Duration;
 
+use farm_core::coordinator::policy::FCFS;
+
 use crate::error::FarmError;
 
 /// How an application connects, and the bounds it keeps.
@@ -16,6 +18,9 @@ pub struct FarmOptions {
     /// Whether queued jobs may be moved between nodes to balance them. Costs a little traffic, and is worth it
     /// whenever devices or jobs are unequal.
     pub global_stealing: bool,
+    /// The coordinator's placement policy for this application's jobs: `fcfs`, `history` (costs of the same jobs of the
+    /// application's last task, longest first), or the name of a plug-in in the coordinator's folder.
+    pub policy: String,
     /// How long connecting and registering may take.
     pub connect_timeout: Duration,
     /// How long a lost coordinator is tried again before the run ends.
@@ -52,6 +57,7 @@ impl FarmOptions {
             name: name.into(),
             weight: 1.0,
             global_stealing: false,
+            policy: FCFS.to_owned(),
             connect_timeout: Duration::from_secs(5),
             reconnect_timeout: Duration::from_secs(30),
             patience: Duration::from_secs(60),

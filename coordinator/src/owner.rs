@@ -145,6 +145,11 @@ impl Owner {
                 Effect::ToNode { link, message } => {
                     (link, self.nodes.get(&link).is_none_or(|peer| peer.tell(message)))
                 }
+                Effect::AskPolicy { id, .. } => {
+                    let answer = Err("this coordinator has no plug-in host".to_owned());
+                    self.machine.handle(now, Event::PolicyAnswered { question: id, answer });
+                    continue;
+                }
                 Effect::Close { link } => {
                     // The machine has forgotten it already.
                     self.forget(link);
@@ -230,6 +235,7 @@ mod tests {
                 name: "app".to_owned(),
                 weight: 1.0,
                 global_stealing: false,
+                policy: String::new(),
                 resume: None,
             };
             let said = [

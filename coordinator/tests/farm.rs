@@ -31,8 +31,14 @@ async fn farm() -> (CoordinatorHandle, String) {
 
 async fn app(address: &str, protocol: u32) -> AppSession {
     let session = control::connect_app(address).await.unwrap();
-    let hello =
-        AppHello { protocol, name: "an app".to_owned(), weight: 1.0, global_stealing: false, resume: None };
+    let hello = AppHello {
+        protocol,
+        name: "an app".to_owned(),
+        weight: 1.0,
+        global_stealing: false,
+        policy: String::new(),
+        resume: None,
+    };
     session.sender.try_send(AppToCoordinator::Hello(hello)).unwrap();
     session
 }
@@ -65,6 +71,7 @@ fn plan_request(jobs: u32) -> AppToCoordinator {
         task: TaskId(2),
         jobs: jobs.collect(),
         needs: Requirements::ANY,
+        module: None,
         contents: Vec::new(),
     })
 }
@@ -164,6 +171,7 @@ async fn a_malformed_message_ends_the_session_by_field() {
         name: "a".to_owned(),
         weight: -1.0,
         global_stealing: false,
+        policy: String::new(),
         resume: None,
     };
     let hello = v1::AppToCoordinator { message: Some(v1::app_to_coordinator::Message::Hello(hello)) };

@@ -10,10 +10,11 @@ use crate::{
         NodeSession, StealId, TaskId,
     },
     program::Content,
+    time::Instant,
 };
 
 /// The protocol this build speaks. A peer of another version is refused at hello.
-pub const PROTOCOL_VERSION: u32 = 1;
+pub const PROTOCOL_VERSION: u32 = 2;
 
 /// Estimated work of a job: nanoseconds on a device of speed 1.0. Zero means unknown.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
@@ -22,6 +23,16 @@ pub struct CostNs(pub u64);
 /// Order inside one application: larger goes first, equal ones first come, first served.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 pub struct Priority(pub i32);
+
+/// When a job may take a device. It says nothing of how much device time its application gets: that is the fair share's.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+pub enum LatencyClass {
+    /// When its turn comes.
+    #[default]
+    Batch,
+    /// Somebody waits for it: ahead of batch jobs, and at the next launch boundary of one that runs.
+    Interactive,
+}
 
 /// How often the two ends of a session say that they are alive, and when silence means what. All in milliseconds.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -66,6 +77,9 @@ pub struct AppHello {
     /// Whether queued jobs may be moved between nodes to balance them (thesis 5.6.3). When a node joins they may be
     /// moved to it in any case.
     pub global_stealing: bool,
+    /// Name of the placement policy for its jobs: [`crate::coordinator::policy::FCFS`] (also when empty),
+    /// [`crate::coordinator::policy::HISTORY`], or a plug-in in the coordinator's folder.
+    pub policy: String,
     /// Who the application was before its connection broke, if it comes back.
     pub resume: Option<(AppId, AppIncarnation)>,
 }
@@ -90,6 +104,9 @@ pub struct PlanRequest {
     pub jobs: Vec<PlanJob>,
     /// What every job of the batch needs of a device.
     pub needs: Requirements,
+    /// The module that every job's program names first: devices are rated for each by itself. `None` for
+    /// programs without a kernel.
+    pub module: Option<ContentHash>,
     /// Task allocations and modules the jobs use: a device that holds them is preferred.
     pub contents: Vec<Content>,
 }
@@ -259,6 +276,19 @@ pub struct NodeHello {
     pub inventory: Vec<JobAttempt>,
 }
 
+/// When and how an attempt went through its node, by the node's own clock.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct JobTrace {
+    /// Handed to the device's executor.
+    pub staged_at: Instant,
+    /// Began to run; equals `ended_at` for an attempt that never ran.
+    pub started_at: Instant,
+    /// Ended.
+    pub ended_at: Instant,
+    /// The sibling device whose queue it was taken from (local steal).
+    pub stolen_from: Option<DeviceIndex>,
+}
+
 /// One finished execution.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Executed {
@@ -268,6 +298,8 @@ pub struct Executed {
     pub device: DeviceIndex,
     /// Measured device time in nanoseconds: what fairness charges.
     pub device_time_ns: u64,
+    /// When and how.
+    pub trace: JobTrace,
     /// `None` when it completed.
     pub failure: Option<JobFailure>,
 }
@@ -275,10 +307,19 @@ pub struct Executed {
 /// How one device of a node stands.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct DeviceLoad {
-    /// Jobs queued or staged.
+    /// Jobs queued, staged or interrupted.
     pub queued_jobs: u32,
-    /// Jobs running (0 or 1).
-    pub running_jobs: u32,
+    /// The job that runs.
+    pub running: Option<RunningJob>,
+}
+
+/// A job that runs.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct RunningJob {
+    /// Which attempt.
+    pub job: JobAttempt,
+    /// For how long, in nanoseconds.
+    pub for_ns: u64,
 }
 
 /// Node to coordinator.
@@ -297,6 +338,8 @@ pub enum NodeToCoordinator {
     },
     /// What ended since the last report. Batched by the machine: every 5 ms or 64 jobs.
     Report {
+        /// When it left, by the node's clock: what relates the traces to other nodes' clocks.
+        sent_at: Instant,
         /// Device free: for scheduling.
         executed: Vec<Executed>,
         /// Acknowledged by the application: the job is over.
@@ -383,7 +426,9 @@ pub struct JobTicket {
     pub job: JobAttempt,
     /// The device the plan names.
     pub device: DeviceIndex,
-    /// Order inside the application.
+    /// When it may take a device.
+    pub class: LatencyClass,
+    /// Order inside the application and class.
     pub priority: Priority,
     /// Estimated work.
     pub cost: CostNs,

@@ -12,9 +12,9 @@ use farm_core::{
     ledger::{self, Ledger, SubmittedJob},
     message::{
         AppHello, AppToCoordinator, AppToNode, Contact, CoordinatorToApp, CoordinatorToNode, CostNs,
-        DevicePlan, Executed, JobFailure, JobTicket, Liveness, NodeHello, NodePlan, NodeToApp,
-        NodeToCoordinator, PROTOCOL_VERSION, Plan, PlanJob, PlanRequest, Priority, ResultAck, ResultHeader,
-        WaitReason,
+        DevicePlan, Executed, JobFailure, JobTicket, JobTrace, LatencyClass, Liveness, NodeHello, NodePlan,
+        NodeToApp, NodeToCoordinator, PROTOCOL_VERSION, Plan, PlanJob, PlanRequest, Priority, ResultAck,
+        ResultHeader, WaitReason,
     },
     program::Content,
     time::Instant,
@@ -86,6 +86,7 @@ fn app_hello(step: Step) -> AppHello {
         name: "app".to_owned(),
         weight: f64::from(step.three),
         global_stealing: step.three != 1,
+        policy: ["", "history", "plugin", "unknown"][usize::from(step.one)].to_owned(),
         resume: (step.two > 1).then(|| (AppId(step.two.into()), AppIncarnation(u32::from(step.four)))),
     }
 }
@@ -108,6 +109,7 @@ fn coordinator_event(step: Step) -> coordinator::Event {
                 limits: Limits { memory_bytes: 1 << (20 + step.three), ..Limits::NONE },
                 ..Requirements::ANY
             },
+            module: (step.one % 2 == 0).then_some(ContentHash([step.two; 32])),
             contents: vec![content(1)],
         })),
         8 => from_app(AppToCoordinator::AlreadyDelivered(vec![
@@ -135,11 +137,13 @@ fn coordinator_event(step: Step) -> coordinator::Event {
             spool_bytes: 0,
         }),
         7 | 9 => from_node(NodeToCoordinator::Report {
+            sent_at: Instant(u64::from(step.four)),
             executed: (0..12)
                 .map(|sequence| Executed {
                     job: attempt(step.two, sequence, sequence * (step.three + 1)),
                     device: DeviceIndex(step.three.into()),
                     device_time_ns: u64::from(step.four) * 1_000,
+                    trace: JobTrace::default(),
                     failure: failure(step.four),
                 })
                 .collect(),
@@ -174,6 +178,7 @@ fn worker_machine() -> WorkerMachine {
         devices: vec![device(1), device(1), device(2)],
         contact: contact(),
         max_jobs: 8,
+        local_stealing: true,
         lottery_gain: 0.15,
         seed: 1,
     })
@@ -201,6 +206,7 @@ fn worker_event(step: Step) -> worker::Event {
                 .map(|index| JobTicket {
                     job: attempt(step.one % 2, index + step.two, step.four),
                     device: DeviceIndex(u16::from(step.two)),
+                    class: if step.one % 3 == 0 { LatencyClass::Interactive } else { LatencyClass::Batch },
                     priority: Priority(step.three.into()),
                     cost: CostNs(step.two.into()),
                     contents: (0..step.three).map(content).collect(),
@@ -300,8 +306,10 @@ fn ledger_event(step: Step) -> ledger::Event {
                 .map(|index| SubmittedJob {
                     index: JobIndex(u32::from(index + step.two)),
                     cost: CostNs(1),
+                    class: LatencyClass::Batch,
                     priority: Priority(0),
                     contents: vec![content(1)],
+                    module: (index % 2 == 0).then_some(ContentHash([1; 32])),
                 })
                 .collect(),
             needs: Requirements::ANY,
@@ -448,7 +456,7 @@ proptest! {
     #[test]
     fn the_ledger_keeps_its_invariants(steps in steps(25)) {
         let hello =
-            AppHello { protocol: PROTOCOL_VERSION, name: "app".to_owned(), weight: 1.0, global_stealing: false, resume: None };
+            AppHello { protocol: PROTOCOL_VERSION, name: "app".to_owned(), weight: 1.0, global_stealing: false, policy: String::new(), resume: None };
         let mut ledger = Ledger::new(hello);
         let mut ends = BTreeMap::new();
         let mut now = Instant::ZERO;

@@ -8,7 +8,7 @@ use farm_core::{
     device::{DeviceInfo, DeviceKind, Features, Limits, Requirements},
     id::{BatchId, Epoch, JobIndex, LinkId, NodeSession, TaskId},
     message::{
-        AppHello, AppToCoordinator, Contact, CoordinatorToApp, CostNs, Executed, NodeHello,
+        AppHello, AppToCoordinator, Contact, CoordinatorToApp, CostNs, Executed, JobTrace, NodeHello,
         NodeToCoordinator, PROTOCOL_VERSION, PlanJob, PlanRequest,
     },
     time::Instant,
@@ -48,6 +48,7 @@ fn farm() -> CoordinatorMachine {
         name: "app".to_owned(),
         weight: 1.0,
         global_stealing: false,
+        policy: String::new(),
         resume: None,
     };
     machine.handle(Instant::ZERO, Event::FromApp { link: APP, message: AppToCoordinator::Hello(hello) });
@@ -64,6 +65,7 @@ fn request(batch: u32) -> Event {
         task: TaskId(0),
         jobs: jobs.collect(),
         needs: Requirements::ANY,
+        module: None,
         contents: Vec::new(),
     };
     Event::FromApp { link: APP, message: AppToCoordinator::Plan(request) }
@@ -106,9 +108,11 @@ fn twenty_thousand_jobs_on_a_thousand_devices() {
                     job,
                     device,
                     device_time_ns: 1_000_000,
+                    trace: JobTrace::default(),
                     failure: None,
                 });
                 let message = NodeToCoordinator::Report {
+                    sent_at: Instant::ZERO,
                     executed: executed.collect(),
                     delivered: report.iter().map(|(_, _, job)| *job).collect(),
                 };

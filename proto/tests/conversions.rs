@@ -13,10 +13,11 @@ use farm_core::{
     },
     message::{
         AppHello, AppToCoordinator, Contact, CoordinatorToApp, CoordinatorToNode, CostNs, DeviceLoad,
-        DevicePlan, Executed, JobFailure, Liveness, NodeHello, NodePlan, NodeToCoordinator, Plan, PlanJob,
-        PlanRequest, WaitReason,
+        DevicePlan, Executed, JobFailure, JobTrace, Liveness, NodeHello, NodePlan, NodeToCoordinator, Plan,
+        PlanJob, PlanRequest, RunningJob, WaitReason,
     },
     program::Content,
+    time::Instant,
 };
 use proptest::{collection::vec, option, prelude::*};
 use prost::Message;
@@ -122,10 +123,11 @@ fn failure() -> impl Strategy<Value = JobFailure> {
 }
 
 fn app_to_coordinator() -> impl Strategy<Value = AppToCoordinator> {
-    let hello = (any::<(u32, bool)>(), "\\PC{0,40}", positive(), option::of(any::<(u64, u32)>())).prop_map(
-        |((protocol, global_stealing), name, weight, resume)| {
+    let names = ("\\PC{0,40}", "\\PC{0,40}");
+    let hello = (any::<(u32, bool)>(), names, positive(), option::of(any::<(u64, u32)>())).prop_map(
+        |((protocol, global_stealing), (name, policy), weight, resume)| {
             let resume = resume.map(|(app, life)| (AppId(app), AppIncarnation(life)));
-            AppToCoordinator::Hello(AppHello { protocol, name, weight, global_stealing, resume })
+            AppToCoordinator::Hello(AppHello { protocol, name, weight, global_stealing, policy, resume })
         },
     );
     let job = |cost: BoxedStrategy<u64>| {
@@ -137,15 +139,11 @@ fn app_to_coordinator() -> impl Strategy<Value = AppToCoordinator> {
         vec(job(Just(7_000_000).boxed()), 0..40),
         vec(job(any::<u64>().boxed()), 0..40),
     ];
-    let plan = (any::<u64>(), any::<u32>(), jobs_of, requirements(), contents()).prop_map(
-        |(batch, task, jobs, needs, contents)| {
-            AppToCoordinator::Plan(PlanRequest {
-                batch: BatchId(batch),
-                task: TaskId(task),
-                jobs,
-                needs,
-                contents,
-            })
+    let module = option::of(any::<[u8; 32]>().prop_map(ContentHash));
+    let plan = (any::<(u64, u32)>(), jobs_of, requirements(), module, contents()).prop_map(
+        |((batch, task), jobs, needs, module, contents)| {
+            let (batch, task) = (BatchId(batch), TaskId(task));
+            AppToCoordinator::Plan(PlanRequest { batch, task, jobs, needs, module, contents })
         },
     );
     prop_oneof![
@@ -197,30 +195,48 @@ fn coordinator_to_app() -> impl Strategy<Value = CoordinatorToApp> {
     ]
 }
 
+/// When the reports leave; traces are of before.
+const SENT_AT: Instant = Instant(1 << 50);
+
+fn trace() -> impl Strategy<Value = JobTrace> {
+    let at = || (0..=SENT_AT.0).prop_map(Instant);
+    (at(), at(), at(), option::of((0..u16::MAX).prop_map(DeviceIndex))).prop_map(
+        |(staged_at, started_at, ended_at, stolen_from)| JobTrace {
+            staged_at,
+            started_at,
+            ended_at,
+            stolen_from,
+        },
+    )
+}
+
 fn node_to_coordinator() -> impl Strategy<Value = NodeToCoordinator> {
     let hello = (any::<(u32, u64)>(), "\\PC{0,40}", vec(device_info(), 0..5), contact(), attempts())
         .prop_map(|((protocol, session), name, devices, contact, inventory)| {
             let session = NodeSession(session);
             NodeToCoordinator::Hello(NodeHello { protocol, name, session, devices, contact, inventory })
         });
-    let load =
-        any::<(u32, u32)>().prop_map(|(queued_jobs, running_jobs)| DeviceLoad { queued_jobs, running_jobs });
-    let outcome = (any::<(u16, u64)>(), option::of(failure()));
-    let executed =
-        (attempts(), vec(outcome, 40)).prop_map(|(attempts, outcomes)| {
-            let executed =
-                attempts.into_iter().zip(outcomes).map(|(job, ((device, device_time_ns), failure))| {
-                    Executed { job, device: DeviceIndex(device), device_time_ns, failure }
-                });
-            executed.collect::<Vec<_>>()
-        });
+    let running = (attempts(), any::<u64>())
+        .prop_map(|(jobs, for_ns)| jobs.first().map(|&job| RunningJob { job, for_ns }));
+    let load = (any::<u32>(), running).prop_map(|(queued_jobs, running)| DeviceLoad { queued_jobs, running });
+    let outcome = (any::<(u16, u64)>(), trace(), option::of(failure()));
+    let executed = (attempts(), vec(outcome, 40)).prop_map(|(attempts, outcomes)| {
+        let executed =
+            attempts.into_iter().zip(outcomes).map(|(job, ((device, device_time_ns), trace, failure))| {
+                Executed { job, device: DeviceIndex(device), device_time_ns, trace, failure }
+            });
+        executed.collect::<Vec<_>>()
+    });
     prop_oneof![
         hello,
         (any::<(u64, u64)>(), vec(load, 0..9)).prop_map(|((sequence, spool_bytes), devices)| {
             NodeToCoordinator::Heartbeat { sequence, devices, spool_bytes }
         }),
-        (executed, attempts())
-            .prop_map(|(executed, delivered)| NodeToCoordinator::Report { executed, delivered }),
+        (executed, attempts()).prop_map(|(executed, delivered)| NodeToCoordinator::Report {
+            sent_at: SENT_AT,
+            executed,
+            delivered
+        }),
         (any::<u16>(), "\\PC{0,80}").prop_map(|(device, reason)| NodeToCoordinator::DeviceLost {
             device: DeviceIndex(device),
             reason
@@ -359,10 +375,18 @@ fn field_of(error: &WireError) -> &'static str {
 fn report(change: impl FnOnce(&mut v1::Report)) -> Result<NodeToCoordinator, WireError> {
     let job = JobId { app: AppId(1), task: TaskId(1), index: JobIndex(1) };
     let job = JobAttempt { job, attempt: Attempt { epoch: Epoch(1), sequence: 1 } };
-    let done =
-        Executed { job, device: DeviceIndex(0), device_time_ns: 5, failure: Some(JobFailure::Timeout) };
-    let wire =
-        v1::NodeToCoordinator::from(NodeToCoordinator::Report { executed: vec![done], delivered: vec![job] });
+    let done = Executed {
+        job,
+        device: DeviceIndex(0),
+        device_time_ns: 5,
+        trace: JobTrace::default(),
+        failure: Some(JobFailure::Timeout),
+    };
+    let wire = v1::NodeToCoordinator::from(NodeToCoordinator::Report {
+        sent_at: SENT_AT,
+        executed: vec![done],
+        delivered: vec![job],
+    });
     let Some(v1::node_to_coordinator::Message::Report(mut report)) = wire.message else {
         panic!("another message")
     };
@@ -373,14 +397,27 @@ fn report(change: impl FnOnce(&mut v1::Report)) -> Result<NodeToCoordinator, Wir
 #[test]
 fn what_is_not_allowed_is_refused_by_field() {
     let hello = |weight: f64, name: &str| {
-        let hello =
-            v1::AppHello { protocol: 1, name: name.to_owned(), weight, resume: None, global_stealing: false };
+        let hello = v1::AppHello {
+            protocol: 1,
+            name: name.to_owned(),
+            weight,
+            resume: None,
+            global_stealing: false,
+            policy: String::new(),
+        };
         AppHello::try_from(hello).map(|_| ())
     };
     let plan = |index_deltas: Vec<i64>, cost_ns: Vec<u64>| {
         let needs = Some(Requirements::ANY.into());
-        let request =
-            v1::PlanRequest { batch: 1, task: 1, index_deltas, cost_ns, needs, contents: Vec::new() };
+        let request = v1::PlanRequest {
+            batch: 1,
+            task: 1,
+            index_deltas,
+            cost_ns,
+            needs,
+            contents: Vec::new(),
+            module: Vec::new(),
+        };
         PlanRequest::try_from(request).map(|_| ())
     };
     let run = |index_deltas: Vec<i64>, sequence_deltas: Vec<i64>| {
@@ -466,6 +503,7 @@ fn a_plan_of_4096_jobs_is_small() {
         task: TaskId(3),
         jobs: (0..4_096).map(|index| PlanJob { index: JobIndex(index), cost: CostNs(1_000_000) }).collect(),
         needs: Requirements::ANY_REAL,
+        module: None,
         contents: Vec::new(),
     };
     let bytes = v1::PlanRequest::from(request).encoded_len();

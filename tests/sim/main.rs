@@ -15,7 +15,7 @@ use farm_core::{
     device::Requirements,
     id::{ContentHash, JobIndex, TaskId},
     ledger::{Event, SubmittedJob},
-    message::{CostNs, JobFailure, Priority},
+    message::{CostNs, JobFailure, LatencyClass, Priority},
     program::Content,
     time::Instant,
 };
@@ -48,8 +48,10 @@ fn jobs(count: u32, known_cost: bool) -> Vec<SubmittedJob> {
         .map(|index| SubmittedJob {
             index: JobIndex(index),
             cost: CostNs(if known_cost { cost_ns(JobIndex(index)) } else { 0 }),
+            class: LatencyClass::Batch,
             priority: Priority(i32::from(index % 7 == 0)),
             contents: vec![content(1), content(u8::try_from(2 + index % 3).expect("small"))],
+            module: Some(ContentHash([1; 32])),
         })
         .collect()
 }

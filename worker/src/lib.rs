@@ -205,6 +205,7 @@ pub async fn start(options: WorkerOptions) -> Result<WorkerHandle, StartError> {
         devices: infos.clone(),
         contact: Contact { addresses: advertise, certificate_der: server.certificate_der().to_vec() },
         max_jobs: MAX_JOBS,
+        local_stealing: true,
         lottery_gain: LOTTERY_GAIN,
         seed: identity,
     };

@@ -183,6 +183,7 @@ pub(crate) async fn drive(setup: DriverSetup) {
         name: options.name.clone(),
         weight: options.weight,
         global_stealing: options.global_stealing,
+        policy: options.policy.clone(),
         resume: None,
     };
     let links = Links::new(handle.inputs.clone(), contents, options.window.result_bytes);

@@ -267,7 +267,14 @@ mod tests {
         for (batch, indices) in [(1, 0..10), (2, 10..20)] {
             let jobs = indices.map(|index| PlanJob { index: JobIndex(index), cost: CostNs(0) }).collect();
             let (needs, contents) = (Requirements::ANY, Vec::new());
-            runs.asked(&PlanRequest { batch: BatchId(batch), task: TaskId(0), jobs, needs, contents });
+            runs.asked(&PlanRequest {
+                batch: BatchId(batch),
+                task: TaskId(0),
+                jobs,
+                needs,
+                module: None,
+                contents,
+            });
             runs.waits(BatchId(batch), TaskId(0), WaitReason::NoNode, Instant::now());
         }
         let unasked = |task, index| {

@@ -11,9 +11,11 @@ use std::{
 use bytes::Bytes;
 use farm_core::{
     device::{Limits, Requirements},
-    id::JobIndex,
-    message::{CostNs, Priority},
-    program::{Content, DispatchError, JobProgram, ProgramError, ProgramQuota, ProgramSummary, validate},
+    id::{ContentHash, JobIndex},
+    message::{CostNs, LatencyClass, Priority},
+    program::{
+        Command, Content, DispatchError, JobProgram, ProgramError, ProgramQuota, ProgramSummary, validate,
+    },
 };
 use proto::codec;
 
@@ -30,7 +32,10 @@ const THREAD_WORTH: Duration = Duration::from_millis(1);
 pub(super) struct Dispatched {
     pub(super) program: Bytes,
     pub(super) contents: Vec<Content>,
+    /// The one that the program names first.
+    pub(super) module: Option<ContentHash>,
     pub(super) cost: CostNs,
+    pub(super) class: LatencyClass,
     pub(super) priority: Priority,
     needs: Limits,
 }
@@ -131,9 +136,9 @@ fn dispatch_one(
     quota: &ProgramQuota,
 ) -> Result<Dispatched, DispatchFault> {
     let mut program = JobProgram::default();
-    let (cost, priority) = catch_panic(|| {
+    let (cost, class, priority) = catch_panic(|| {
         job.dispatch(&mut program)?;
-        Ok((job.cost(), job.priority()))
+        Ok((job.cost(), job.latency_class(), job.priority()))
     })
     .map_err(DispatchFault::Panicked)?
     .map_err(DispatchFault::Verb)?;
@@ -145,8 +150,12 @@ fn dispatch_one(
     if let Some(content) = contents.iter().find(|content| !known.contains(content)) {
         return Err(DispatchFault::UnknownContent(*content));
     }
+    let module = program.commands().iter().find_map(|command| match command {
+        Command::Function { module, .. } => Some(module.hash),
+        _ => None,
+    });
     let program = codec::encode_program(&program).map_err(DispatchFault::Encode)?;
-    Ok(Dispatched { program, contents, cost, priority, needs })
+    Ok(Dispatched { program, contents, module, cost, class, priority, needs })
 }
 
 const fn needs_of(summary: &ProgramSummary) -> Limits {
@@ -197,8 +206,6 @@ pub(super) fn catch_panic<T>(code: impl FnOnce() -> T) -> Result<T, String> {
 
 #[cfg(test)]
 mod tests {
-    use farm_core::id::ContentHash;
-
     use super::*;
 
     /// Fails, panics or names an unknown content at chosen indices.

@@ -553,8 +553,9 @@ impl Batch {
         self.jobs.reserve(chunk.len());
         self.programs.reserve(chunk.len());
         for (index, job) in (first..).zip(chunk) {
-            let Dispatched { program, contents, cost, priority, .. } = job;
-            self.jobs.push(SubmittedJob { index: JobIndex(index), cost, priority, contents });
+            let Dispatched { program, contents, module, cost, class, priority, .. } = job;
+            let index = JobIndex(index);
+            self.jobs.push(SubmittedJob { index, cost, class, priority, contents, module });
             self.programs.push(program);
         }
     }

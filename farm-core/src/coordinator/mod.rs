@@ -11,18 +11,20 @@ mod invariants;
 mod lease;
 mod model;
 mod placement;
+pub mod policy;
 mod registry;
 mod replan;
 mod report;
 mod status;
 mod steal;
 
-use std::collections::{BTreeMap, VecDeque};
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
 use serde::{Deserialize, Serialize};
 
 use self::{
     model::{App, Calibration, Node, Peer, Pending},
+    policy::{Choice, Question, QuestionId},
     steal::Steal,
 };
 use crate::{
@@ -43,6 +45,8 @@ pub struct CoordinatorConfig {
     pub app_lease_ms: u64,
     /// Attempts that may end with their device or node before the job counts as poison.
     pub max_crashes: u32,
+    /// Names of the plug-in policies that can be asked.
+    pub plugins: BTreeSet<String>,
     /// Seed of the machine's one generator.
     pub seed: u64,
 }
@@ -51,7 +55,14 @@ impl CoordinatorConfig {
     /// The design's values (20-delivery.md).
     #[must_use]
     pub fn new(epoch: Epoch, seed: u64) -> Self {
-        Self { epoch, liveness: Liveness::default(), app_lease_ms: 30_000, max_crashes: 3, seed }
+        Self {
+            epoch,
+            liveness: Liveness::default(),
+            app_lease_ms: 30_000,
+            max_crashes: 3,
+            plugins: BTreeSet::new(),
+            seed,
+        }
     }
 }
 
@@ -82,6 +93,13 @@ pub enum Event {
         /// Which.
         node: NodeId,
     },
+    /// A plug-in answered, or will not.
+    PolicyAnswered {
+        /// Which question.
+        question: QuestionId,
+        /// A choice for every job, in the order they should run; or why there is none, for people.
+        answer: Result<Vec<Choice>, String>,
+    },
 }
 
 /// What a coordinator wants done.
@@ -105,6 +123,15 @@ pub enum Effect {
     Close {
         /// Which.
         link: LinkId,
+    },
+    /// Ask a plug-in; answer with [`Event::PolicyAnswered`]. An answer that comes too late is ignored.
+    AskPolicy {
+        /// Which question.
+        id: QuestionId,
+        /// The plug-in's name, one of [`CoordinatorConfig::plugins`].
+        plugin: String,
+        /// What is asked.
+        question: Question,
     },
 }
 
@@ -269,6 +296,8 @@ impl CoordinatorMachine {
                 self.drain(node);
                 None
             }
+            // Nothing was asked.
+            Event::PolicyAnswered { .. } => None,
         };
         self.place_pending(now);
         match speaker {
@@ -334,7 +363,7 @@ impl CoordinatorMachine {
                 self.loads_reported(node, &devices);
                 self.tell_node(node, CoordinatorToNode::HeartbeatAck { sequence });
             }
-            NodeToCoordinator::Report { executed, delivered } => {
+            NodeToCoordinator::Report { sent_at: _, executed, delivered } => {
                 self.reported(now, node, executed, &delivered)
             }
             NodeToCoordinator::DeviceLost { device, reason } => self.device_lost(node, device, &reason),

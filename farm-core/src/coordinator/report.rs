@@ -31,7 +31,7 @@ impl CoordinatorMachine {
     pub(super) fn loads_reported(&mut self, id: NodeId, loads: &[DeviceLoad]) {
         let Some(node) = self.nodes.get_mut(&id) else { return };
         for (device, load) in node.devices.iter_mut().zip(loads) {
-            device.running_jobs = load.running_jobs;
+            device.running_jobs = load.running.is_some().into();
         }
     }
 
@@ -45,7 +45,8 @@ impl CoordinatorMachine {
     }
 
     fn executed(&mut self, now: Instant, node: NodeId, ended: Executed) {
-        let Executed { job: JobAttempt { job: id, attempt }, device, device_time_ns, failure } = ended;
+        let Executed { job: JobAttempt { job: id, attempt }, device, device_time_ns, trace: _, failure } =
+            ended;
         // Reports of attempts that were replaced meanwhile change nothing.
         if self.holder(id) != Some((node, attempt)) {
             return;

@@ -3,8 +3,8 @@
 use super::{Effect, Ledger, SubmittedJob, nodes::NodeLife};
 use crate::{
     device::Requirements,
-    id::{AppId, Attempt, BatchId, DeviceIndex, JobAttempt, JobId, JobIndex, JobKey, TaskId},
-    message::{CostNs, JobFailure, Plan, Priority, ResultHeader},
+    id::{AppId, Attempt, BatchId, ContentHash, DeviceIndex, JobAttempt, JobId, JobIndex, JobKey, TaskId},
+    message::{CostNs, JobFailure, LatencyClass, Plan, Priority, ResultHeader},
     program::Content,
     time::Instant,
 };
@@ -24,6 +24,7 @@ pub(super) struct Placement {
 #[derive(Debug)]
 pub(super) struct Job {
     pub(super) cost: CostNs,
+    pub(super) class: LatencyClass,
     pub(super) priority: Priority,
     pub(super) contents: Vec<Content>,
     pub(super) batch: BatchId,
@@ -36,6 +37,7 @@ pub(super) struct Job {
 pub(super) struct Batch {
     pub(super) task: TaskId,
     pub(super) needs: Requirements,
+    pub(super) module: Option<ContentHash>,
     /// All of its jobs, in order of submission.
     pub(super) indices: Vec<JobIndex>,
     /// Jobs not over.
@@ -49,24 +51,25 @@ pub(super) struct Batch {
 impl Ledger {
     pub(super) fn submitted(&mut self, task: TaskId, jobs: Vec<SubmittedJob>, needs: Requirements) {
         let mut indices = Vec::with_capacity(jobs.len().min(MAX_BATCH_JOBS));
+        let mut batch_module = None;
         for job in jobs {
             let key = JobKey { task, index: job.index };
             if self.jobs.contains_key(&key) || self.over.contains(&key) {
                 tracing::warn!(%task, job = %job.index, "submitted twice, the first one counts");
                 continue;
             }
-            let SubmittedJob { index, cost, priority, contents } = job;
-            self.jobs
-                .insert(key, Job { cost, priority, contents, batch: BatchId(self.next_batch), place: None });
+            let SubmittedJob { index, cost, class, priority, contents, module } = job;
+            // A batch is of one module: its jobs are estimated by one rate of each device.
+            if indices.len() == MAX_BATCH_JOBS || module != batch_module {
+                self.add_batch(task, needs, batch_module, std::mem::take(&mut indices));
+                batch_module = module;
+            }
+            let batch = BatchId(self.next_batch);
+            self.jobs.insert(key, Job { cost, class, priority, contents, batch, place: None });
             self.counts.waiting_jobs += 1;
             indices.push(index);
-            if indices.len() == MAX_BATCH_JOBS {
-                self.add_batch(task, needs, std::mem::take(&mut indices));
-            }
         }
-        if !indices.is_empty() {
-            self.add_batch(task, needs, indices);
-        }
+        self.add_batch(task, needs, batch_module, indices);
     }
 
     pub(super) fn planned(&mut self, now: Instant, plan: Plan) {
@@ -166,11 +169,21 @@ impl Ledger {
         self.counts.outstanding_jobs = 0;
     }
 
-    fn add_batch(&mut self, task: TaskId, needs: Requirements, indices: Vec<JobIndex>) {
+    fn add_batch(
+        &mut self,
+        task: TaskId,
+        needs: Requirements,
+        module: Option<ContentHash>,
+        indices: Vec<JobIndex>,
+    ) {
+        if indices.is_empty() {
+            return;
+        }
         let id = BatchId(self.next_batch);
         self.next_batch += 1;
         let open_jobs = u32::try_from(indices.len()).expect("a batch holds at most MAX_BATCH_JOBS");
-        let batch = Batch { task, needs, indices, open_jobs, waiting_jobs: open_jobs, requested: false };
+        let batch =
+            Batch { task, needs, module, indices, open_jobs, waiting_jobs: open_jobs, requested: false };
         self.batches.insert(id, batch);
         self.to_request.push_back(id);
     }

@@ -21,8 +21,8 @@ use crate::{
     device::Requirements,
     id::{AppId, BatchId, ContentHash, JobAttempt, JobId, JobIndex, JobKey, NodeId, NodeSession, TaskId},
     message::{
-        AppHello, AppToCoordinator, AppToNode, Contact, CoordinatorToApp, CostNs, JobFailure, Liveness,
-        NodeToApp, Priority, WaitReason,
+        AppHello, AppToCoordinator, AppToNode, Contact, CoordinatorToApp, CostNs, JobFailure, LatencyClass,
+        Liveness, NodeToApp, Priority, WaitReason,
     },
     program::Content,
     time::Instant,
@@ -35,10 +35,14 @@ pub struct SubmittedJob {
     pub index: JobIndex,
     /// Estimated work.
     pub cost: CostNs,
-    /// Order inside the application.
+    /// When it may take a device.
+    pub class: LatencyClass,
+    /// Order inside the application and class.
     pub priority: Priority,
     /// Task allocations and modules its program names.
     pub contents: Vec<Content>,
+    /// The module that its program names first.
+    pub module: Option<ContentHash>,
 }
 
 /// What happens to an application.

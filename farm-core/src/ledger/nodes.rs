@@ -326,6 +326,7 @@ impl Ledger {
             tickets.push(JobTicket {
                 job: JobAttempt { job: key.in_app(app), attempt: *attempt },
                 device: place.device,
+                class: job.class,
                 priority: job.priority,
                 cost: job.cost,
                 contents: job.contents.clone(),

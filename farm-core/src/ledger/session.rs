@@ -187,8 +187,9 @@ impl Ledger {
             return;
         }
         let contents = contents.into_iter().take(MAX_REQUEST_CONTENTS).collect();
-        let (task, needs) = (batch.task, batch.needs);
-        self.tell_coordinator(AppToCoordinator::Plan(PlanRequest { batch: id, task, jobs, needs, contents }));
+        let (task, needs, module) = (batch.task, batch.needs, batch.module);
+        let request = PlanRequest { batch: id, task, jobs, needs, module, contents };
+        self.tell_coordinator(AppToCoordinator::Plan(request));
     }
 
     /// Tells the coordinator that a job it planned is over.

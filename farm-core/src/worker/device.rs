@@ -5,12 +5,12 @@ use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
 use super::{
     Effect, WorkerMachine,
-    job::{HeldState, Rank, Spooled},
+    job::{Handed, HeldState, Rank, Spooled},
 };
 use crate::{
     device::DeviceInfo,
     id::{AppId, ContentHash, DeviceIndex, JobAttempt, JobId},
-    message::{CostNs, DeviceLoad, Executed, JobFailure, NodeToCoordinator},
+    message::{CostNs, DeviceLoad, Executed, JobFailure, NodeToCoordinator, RunningJob},
     time::Instant,
 };
 
@@ -48,14 +48,6 @@ impl Device {
             waiting_jobs: 0,
             handed_over: VecDeque::new(),
         }
-    }
-
-    /// As the coordinator is told.
-    pub(super) fn load(&self) -> DeviceLoad {
-        let running = self.handed_over.len().min(1);
-        let queued = self.queued_jobs + self.waiting_jobs + self.handed_over.len() - running;
-        let count = |jobs| u32::try_from(jobs).unwrap_or(u32::MAX);
-        DeviceLoad { queued_jobs: count(queued), running_jobs: count(running) }
     }
 
     pub(super) fn enqueue(&mut self, rank: Rank, cost: CostNs) {
@@ -101,28 +93,31 @@ impl Device {
 
 impl WorkerMachine {
     /// Hands jobs to executors until every device has a running and a staged one, or nothing is left.
-    pub(super) fn fill_devices(&mut self) {
+    pub(super) fn fill_devices(&mut self, now: Instant) {
         if self.devices.iter().all(|device| device.queued_jobs == 0) {
             return;
         }
         for index in self.device_indices() {
-            while self.has_room(index) && self.hand_over_own(index) {}
+            while self.has_room(index) && self.hand_over(now, index, index) {}
+        }
+        if !self.config.local_stealing {
+            return;
         }
         // An idle device steals whatever is queued; a busy one only what its owner would not start next.
         for (handed_over, left) in [(0, 1), (1, 2)] {
             for index in self.device_indices() {
                 if self.device_mut(index).handed_over.len() == handed_over {
-                    self.steal(index, left);
+                    self.steal(now, index, left);
                 }
             }
         }
     }
 
-    pub(super) fn started(&mut self, job: JobAttempt, device: DeviceIndex) {
-        let Some(held) = self.jobs.get(&job.job).filter(|held| held.attempt == job.attempt) else { return };
-        if !matches!(held.state, HeldState::HandedOver) || held.device != device {
-            return;
-        }
+    pub(super) fn started(&mut self, now: Instant, job: JobAttempt, device: DeviceIndex) {
+        let held =
+            self.jobs.get_mut(&job.job).filter(|held| (held.attempt, held.device) == (job.attempt, device));
+        let Some(HeldState::HandedOver(handed)) = held.map(|held| &mut held.state) else { return };
+        handed.started_at = Some(now);
         let handed_over = &mut self.device_mut(device).handed_over;
         // The executor says which one runs: it goes to the front.
         if let Some(position) = handed_over.iter().position(|other| *other == job.job) {
@@ -140,28 +135,30 @@ impl WorkerMachine {
     ) {
         let current =
             self.jobs.get(&job.job).filter(|held| held.attempt == job.attempt && held.device == device);
-        if !current.is_some_and(|held| matches!(held.state, HeldState::HandedOver)) {
+        let Some(HeldState::HandedOver(handed)) = current.map(|held| &held.state) else {
             // Aborted, replaced, or lost with its device: nobody waits for this payload. A spooled result of the same
             // attempt is another matter, and stays.
             if self.jobs.get(&job.job).is_none_or(|held| held.attempt != job.attempt) {
                 self.push(Effect::Discard(job));
             }
             return;
-        }
+        };
+        let trace = handed.trace(now);
         let cost = device_time_ns as f64 / NANOSECONDS_PER_SECOND * self.device_mut(device).info.score;
         self.share.charge(job.job.app, cost);
         match outcome {
             Err(failure) if failure.can_be_retried() => {
                 self.remove(job);
                 self.push(Effect::Discard(job));
-                self.reports.executed(now, Executed { job, device, device_time_ns, failure: Some(failure) });
+                let failed = Executed { job, device, device_time_ns, trace, failure: Some(failure) };
+                self.reports.executed(now, failed);
             }
             Ok((sections, digest)) => {
-                self.reports.executed(now, Executed { job, device, device_time_ns, failure: None });
+                self.reports.executed(now, Executed { job, device, device_time_ns, trace, failure: None });
                 self.spool(job, Spooled::completed(job, device, device_time_ns, sections, digest));
             }
             Err(failure) => {
-                let failed = Executed { job, device, device_time_ns, failure: Some(failure.clone()) };
+                let failed = Executed { job, device, device_time_ns, trace, failure: Some(failure.clone()) };
                 self.reports.executed(now, failed);
                 self.spool(job, Spooled::failed(job, device, device_time_ns, failure));
             }
@@ -181,7 +178,7 @@ impl WorkerMachine {
         for (&job, held) in self.jobs.iter().filter(|(_, held)| held.device == index) {
             let job = JobAttempt { job, attempt: held.attempt };
             match held.state {
-                HeldState::HandedOver => on_it.push(job),
+                HeldState::HandedOver(_) => on_it.push(job),
                 HeldState::Fetching { .. } | HeldState::Queued => queued.push((held.arrival, job)),
                 HeldState::Executed(_) => {}
             }
@@ -195,6 +192,25 @@ impl WorkerMachine {
         for (_, job) in queued {
             self.move_or_give_back(now, job, index);
         }
+    }
+
+    /// As the coordinator is told.
+    pub(super) fn loads(&self, now: Instant) -> Vec<DeviceLoad> {
+        self.devices.iter().map(|device| self.load(now, device)).collect()
+    }
+
+    fn load(&self, now: Instant, device: &Device) -> DeviceLoad {
+        let running = device.handed_over.front().and_then(|&id| {
+            let held = self.jobs.get(&id)?;
+            let HeldState::HandedOver(Handed { started_at: Some(started_at), .. }) = held.state else {
+                return None;
+            };
+            let for_ns = u64::try_from(now.since(started_at).as_nanos()).unwrap_or(u64::MAX);
+            Some(RunningJob { job: JobAttempt { job: id, attempt: held.attempt }, for_ns })
+        });
+        let held = device.queued_jobs + device.waiting_jobs + device.handed_over.len();
+        let queued_jobs = u32::try_from(held - usize::from(running.is_some())).unwrap_or(u32::MAX);
+        DeviceLoad { queued_jobs, running }
     }
 
     pub(super) fn lost_devices(&self) -> impl Iterator<Item = DeviceIndex> {
@@ -226,12 +242,8 @@ impl WorkerMachine {
         !device.lost && device.handed_over.len() < MAX_HANDED_OVER
     }
 
-    fn hand_over_own(&mut self, index: DeviceIndex) -> bool {
-        self.hand_over(index, index)
-    }
-
     /// Takes a job of the sibling with the longest queue, if that has at least `least` queued.
-    fn steal(&mut self, thief: DeviceIndex, least: usize) -> bool {
+    fn steal(&mut self, now: Instant, thief: DeviceIndex, least: usize) -> bool {
         let Some(own) = self.devices.get(usize::from(thief.0)).filter(|device| !device.lost) else {
             return false;
         };
@@ -243,11 +255,11 @@ impl WorkerMachine {
         });
         let longest = victims.max_by(|(_, one), (_, other)| one.backlog().total_cmp(&other.backlog()));
         let Some(victim) = longest.map(|(index, _)| DeviceIndex(index)) else { return false };
-        self.hand_over(victim, thief)
+        self.hand_over(now, victim, thief)
     }
 
     /// Draws an application among those with jobs in a device's queue, and hands its first job to a device.
-    fn hand_over(&mut self, from: DeviceIndex, to: DeviceIndex) -> bool {
+    fn hand_over(&mut self, now: Instant, from: DeviceIndex, to: DeviceIndex) -> bool {
         let Some(source) = self.devices.get(usize::from(from.0)) else { return false };
         let Some(app) = self.share.draw(&mut source.queues.keys().copied(), &mut self.rng) else {
             return false;
@@ -256,7 +268,8 @@ impl WorkerMachine {
             return false;
         };
         let Some(held) = self.jobs.get_mut(&rank.job) else { return false };
-        held.state = HeldState::HandedOver;
+        let stolen_from = (from != to).then_some(from);
+        held.state = HeldState::HandedOver(Handed { staged_at: now, started_at: None, stolen_from });
         held.device = to;
         let (attempt, cost) = (held.attempt, held.cost);
         self.device_mut(from).dequeue(rank, cost);

@@ -43,7 +43,7 @@ impl WorkerMachine {
                 HeldState::Fetching { .. } | HeldState::Queued => {
                     queued.push((held.arrival, JobAttempt { job, attempt: held.attempt }));
                 }
-                HeldState::HandedOver | HeldState::Executed(_) => {}
+                HeldState::HandedOver(_) | HeldState::Executed(_) => {}
             }
         }
         queued.sort_unstable();
@@ -61,7 +61,7 @@ impl WorkerMachine {
             return;
         }
         if self.session.is_registered() {
-            self.flush_all_reports();
+            self.flush_all_reports(now);
             self.tell_coordinator(NodeToCoordinator::Goodbye);
         }
         self.drain = Drain::Gone;

@@ -7,7 +7,7 @@ use super::{
 };
 use crate::{
     id::{AppId, DeviceIndex, JobAttempt, JobId, LinkId},
-    message::{Executed, JobFailure, JobTicket},
+    message::{Executed, JobFailure, JobTicket, JobTrace},
     time::Instant,
 };
 
@@ -51,7 +51,7 @@ impl WorkerMachine {
     pub(super) fn drop_job(&mut self, job: JobAttempt) {
         let Some(held) = self.jobs.get(&job.job).filter(|held| held.attempt == job.attempt) else { return };
         let device = held.device;
-        if matches!(held.state, HeldState::HandedOver) {
+        if matches!(held.state, HeldState::HandedOver(_)) {
             self.push(Effect::Abort { job, device });
         }
         self.remove(job);
@@ -93,7 +93,9 @@ impl WorkerMachine {
         device: DeviceIndex,
         failure: JobFailure,
     ) {
-        self.reports.executed(now, Executed { job, device, device_time_ns: 0, failure: Some(failure) });
+        let trace = JobTrace { staged_at: now, started_at: now, ended_at: now, stolen_from: None };
+        self.reports
+            .executed(now, Executed { job, device, device_time_ns: 0, trace, failure: Some(failure) });
     }
 
     /// Takes a job off every book. Its state says which books those are.
@@ -107,7 +109,7 @@ impl WorkerMachine {
                 self.device_mut(held.device).dequeue(rank, held.cost);
                 self.became_inactive(job.job.app);
             }
-            HeldState::HandedOver => {
+            HeldState::HandedOver(_) => {
                 self.device_mut(held.device).handed_over.retain(|other| *other != job.job);
                 self.became_inactive(job.job.app);
             }
@@ -149,13 +151,14 @@ impl WorkerMachine {
     }
 
     fn hold(&mut self, link: LinkId, device: DeviceIndex, ticket: JobTicket) {
-        let JobTicket { job, device: _, priority, cost, mut contents } = ticket;
+        let JobTicket { job, device: _, class, priority, cost, mut contents } = ticket;
         contents.sort_unstable();
         contents.dedup_by_key(|content| content.hash);
         let missing = self.hold_contents(link, job, &contents);
         let held = HeldJob {
             attempt: job.attempt,
             device,
+            class,
             priority,
             cost,
             contents,
@@ -181,12 +184,20 @@ impl WorkerMachine {
 
     /// A job that is wrong by its ticket fails as if it had run: its application is told until it acknowledges.
     fn refuse(&mut self, now: Instant, device: DeviceIndex, ticket: &JobTicket, failure: JobFailure) {
-        let JobTicket { job, priority, cost, .. } = *ticket;
+        let JobTicket { job, class, priority, cost, .. } = *ticket;
         let state = HeldState::Executed(Spooled::failed(job, device, 0, failure.clone()));
         let arrival = self.next_arrival;
         self.next_arrival += 1;
-        let held =
-            HeldJob { attempt: job.attempt, device, priority, cost, contents: Vec::new(), arrival, state };
+        let held = HeldJob {
+            attempt: job.attempt,
+            device,
+            class,
+            priority,
+            cost,
+            contents: Vec::new(),
+            arrival,
+            state,
+        };
         self.jobs.insert(job.job, held);
         if let Some(app) = self.apps.get_mut(&job.job.app) {
             app.held_jobs += 1;

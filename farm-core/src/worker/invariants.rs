@@ -25,7 +25,7 @@ impl WorkerMachine {
             .values()
             .map(|held| match &held.state {
                 HeldState::Executed(spooled) => spooled.size_bytes,
-                HeldState::Fetching { .. } | HeldState::Queued | HeldState::HandedOver => 0,
+                HeldState::Fetching { .. } | HeldState::Queued | HeldState::HandedOver(_) => 0,
             })
             .sum();
         assert_eq!(spooled, self.spool_bytes, "I8: the spool's size is the sum of its results");
@@ -49,7 +49,7 @@ impl WorkerMachine {
                     assert!(there, "I1: {id} is not in the queue of {}", held.device);
                     queued += 1;
                 }
-                HeldState::HandedOver => {
+                HeldState::HandedOver(_) => {
                     let there = device.handed_over.iter().filter(|other| *other == id).count();
                     assert_eq!(there, 1, "I1: {id} is not with the executor of {}", held.device);
                     handed_over += 1;
@@ -105,7 +105,7 @@ impl WorkerMachine {
             assert_eq!(held.len(), app.held_jobs, "jobs of {id}");
             let active = held
                 .iter()
-                .filter(|held| matches!(held.state, HeldState::Queued | HeldState::HandedOver))
+                .filter(|held| matches!(held.state, HeldState::Queued | HeldState::HandedOver(_)))
                 .count();
             assert_eq!(active, app.active_jobs, "active jobs of {id}");
         }
@@ -126,7 +126,7 @@ impl WorkerMachine {
                 HeldState::Fetching { missing } => {
                     assert_eq!(missing, missing_now, "contents that a job waits for")
                 }
-                HeldState::Queued | HeldState::HandedOver => {
+                HeldState::Queued | HeldState::HandedOver(_) => {
                     assert_eq!(missing_now, 0, "contents of a ready job")
                 }
                 HeldState::Executed(_) => {

@@ -7,8 +7,9 @@ use std::{
 
 use crate::{
     id::{AppId, Attempt, ContentHash, DeviceIndex, JobAttempt, JobId},
-    message::{CostNs, JobFailure, Priority, ResultHeader},
+    message::{CostNs, JobFailure, JobTrace, LatencyClass, Priority, ResultHeader},
     program::Content,
+    time::Instant,
 };
 
 /// Most tombstones. A late duplicate older than this many ended jobs would be executed again; its result is then
@@ -24,6 +25,7 @@ pub(super) struct HeldJob {
     pub(super) attempt: Attempt,
     /// The device whose queue it is in or on which it is.
     pub(super) device: DeviceIndex,
+    pub(super) class: LatencyClass,
     pub(super) priority: Priority,
     pub(super) cost: CostNs,
     /// Each once; empty after execution.
@@ -33,9 +35,9 @@ pub(super) struct HeldJob {
 }
 
 impl HeldJob {
-    /// Its place in a queue: priority, then first come, first served.
+    /// Its place in a queue: class, priority, then first come, first served.
     pub(super) const fn rank(&self, job: JobId) -> Rank {
-        Rank { priority: Reverse(self.priority), arrival: self.arrival, job }
+        Rank { class: Reverse(self.class), priority: Reverse(self.priority), arrival: self.arrival, job }
     }
 }
 
@@ -49,10 +51,32 @@ pub(super) enum HeldState {
     },
     /// In its device's queue.
     Queued,
-    /// With its device's executor, staged or running.
-    HandedOver,
+    /// With its device's executor.
+    HandedOver(Handed),
     /// Its result waits for acknowledgement.
     Executed(Spooled),
+}
+
+/// How a job came to its executor.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Handed {
+    pub(super) staged_at: Instant,
+    /// `None` while it is only staged.
+    pub(super) started_at: Option<Instant>,
+    /// The sibling whose queue it was taken from.
+    pub(super) stolen_from: Option<DeviceIndex>,
+}
+
+impl Handed {
+    /// What is told of an attempt that ends now.
+    pub(super) fn trace(self, now: Instant) -> JobTrace {
+        JobTrace {
+            staged_at: self.staged_at,
+            started_at: self.started_at.unwrap_or(now),
+            ended_at: now,
+            stolen_from: self.stolen_from,
+        }
+    }
 }
 
 /// A result that waits for acknowledgement.
@@ -95,6 +119,7 @@ impl Spooled {
 /// Order of a queue: the least is the next.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) struct Rank {
+    pub(super) class: Reverse<LatencyClass>,
     pub(super) priority: Reverse<Priority>,
     pub(super) arrival: u64,
     pub(super) job: JobId,

@@ -55,6 +55,8 @@ pub struct WorkerConfig {
     pub contact: Contact,
     /// Most jobs held, executed and unacknowledged ones too; further ones are given back (`JobFailure::Returned`).
     pub max_jobs: usize,
+    /// Whether an idle device takes jobs of its siblings. On, but where its gain is measured.
+    pub local_stealing: bool,
     /// Gain of the lottery's feedback (10-scheduling.md section 2: c = 0.15).
     pub lottery_gain: f64,
     /// Seed of the machine's one generator.
@@ -236,7 +238,7 @@ impl WorkerMachine {
             Event::AppLinkClosed { link } => self.app_link_closed(now, link),
             Event::ContentReady(content) => self.content_ready(content),
             Event::ContentFailed { content, reason } => self.content_failed(now, content, &reason),
-            Event::Started { job, device } => self.started(job, device),
+            Event::Started { job, device } => self.started(now, job, device),
             Event::Executed { job, device, device_time_ns, outcome } => {
                 self.executed(now, job, device, device_time_ns, outcome);
             }
@@ -282,7 +284,7 @@ impl WorkerMachine {
 
     /// What follows from any event: devices get work, reports leave, a drained node goes.
     fn settle(&mut self, now: Instant) {
-        self.fill_devices();
+        self.fill_devices(now);
         self.flush_reports(now);
         self.advance_drain(now);
     }

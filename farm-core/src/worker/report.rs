@@ -94,7 +94,7 @@ impl Reports {
         }
     }
 
-    fn take_message(&mut self) -> NodeToCoordinator {
+    fn take_message(&mut self, sent_at: Instant) -> NodeToCoordinator {
         let mut executed = Vec::new();
         let mut delivered = Vec::new();
         for entry in self.unsent.drain(..self.unsent.len().min(MAX_REPORT_ENTRIES)) {
@@ -104,7 +104,7 @@ impl Reports {
             }
             self.unconfirmed.push_back((self.last_heartbeat, entry));
         }
-        NodeToCoordinator::Report { executed, delivered }
+        NodeToCoordinator::Report { sent_at, executed, delivered }
     }
 }
 
@@ -116,11 +116,11 @@ impl WorkerMachine {
         }
         let due = self.reports.due.is_some_and(|due| due <= now);
         if due || self.reports.urgent || self.is_idle() {
-            self.flush_all_reports();
+            self.flush_all_reports(now);
             return;
         }
         while self.reports.unsent.len() >= MAX_REPORT_ENTRIES {
-            let message = self.reports.take_message();
+            let message = self.reports.take_message(now);
             self.tell_coordinator(message);
         }
         if self.reports.unsent.is_empty() {
@@ -128,9 +128,9 @@ impl WorkerMachine {
         }
     }
 
-    pub(super) fn flush_all_reports(&mut self) {
+    pub(super) fn flush_all_reports(&mut self, now: Instant) {
         while !self.reports.unsent.is_empty() {
-            let message = self.reports.take_message();
+            let message = self.reports.take_message(now);
             self.tell_coordinator(message);
         }
         self.reports.due = None;

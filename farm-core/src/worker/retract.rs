@@ -43,7 +43,7 @@ impl WorkerMachine {
             Some(held) if held.attempt == job.attempt => match held.state {
                 HeldState::Fetching { .. } | HeldState::Queued => Found::Waiting,
                 // The first one runs or is about to; one behind it is only staged.
-                HeldState::HandedOver => {
+                HeldState::HandedOver(_) => {
                     let device = self.devices.get(usize::from(held.device.0));
                     let first = device.and_then(|device| device.handed_over.front());
                     if first == Some(&job.job) { Found::Begun } else { Found::Waiting }

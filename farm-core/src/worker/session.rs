@@ -6,7 +6,7 @@ use std::time::Duration;
 use super::{Effect, WorkerMachine, drain::Drain};
 use crate::{
     id::JobAttempt,
-    message::{CoordinatorToNode, DeviceLoad, Liveness, NodeHello, NodeToCoordinator, PROTOCOL_VERSION},
+    message::{CoordinatorToNode, Liveness, NodeHello, NodeToCoordinator, PROTOCOL_VERSION},
     time::Instant,
 };
 
@@ -94,17 +94,13 @@ impl WorkerMachine {
         }
         self.session = Session::Registered { liveness, next_heartbeat: next_heartbeat(now, &liveness) };
         self.heartbeat_sequence += 1;
-        let devices = self.loads();
+        let devices = self.loads(now);
         self.tell_coordinator(NodeToCoordinator::Heartbeat {
             sequence: self.heartbeat_sequence,
             devices,
             spool_bytes: self.spool_bytes,
         });
         self.reports.heartbeat_said(self.heartbeat_sequence);
-    }
-
-    fn loads(&self) -> Vec<DeviceLoad> {
-        self.devices.iter().map(super::device::Device::load).collect()
     }
 
     /// The coordinator may have missed it, or be another one.

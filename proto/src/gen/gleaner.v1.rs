@@ -785,6 +785,9 @@ pub struct AppHello {
     /// Whether queued jobs may be moved between nodes to balance them.
     #[prost(bool, tag = "5")]
     pub global_stealing: bool,
+    /// Name of the placement policy; empty for first come, first served.
+    #[prost(string, tag = "6")]
+    pub policy: ::prost::alloc::string::String,
 }
 /// An application and which life of it.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
@@ -817,6 +820,9 @@ pub struct PlanRequest {
     /// Task allocations and modules the jobs use.
     #[prost(message, repeated, tag = "6")]
     pub contents: ::prost::alloc::vec::Vec<Content>,
+    /// blake3 of the module that every job's program names first: 32 bytes, or none.
+    #[prost(bytes = "vec", tag = "7")]
+    pub module: ::prost::alloc::vec::Vec<u8>,
 }
 /// A node whose data plane cannot be reached from the application.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
@@ -1342,14 +1348,24 @@ pub struct NodeHeartbeat {
     pub spool_bytes: u64,
 }
 /// How one device stands.
-#[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
+#[derive(Clone, PartialEq, ::prost::Message)]
 pub struct DeviceLoad {
-    /// Jobs queued or staged.
+    /// Jobs queued, staged or interrupted.
     #[prost(uint32, tag = "1")]
     pub queued_jobs: u32,
-    /// Jobs running.
-    #[prost(uint32, tag = "2")]
-    pub running_jobs: u32,
+    /// The job that runs, if any.
+    #[prost(message, optional, tag = "2")]
+    pub running: ::core::option::Option<RunningJob>,
+}
+/// A job that runs.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct RunningJob {
+    /// Which: one attempt.
+    #[prost(message, optional, tag = "1")]
+    pub job: ::core::option::Option<Attempts>,
+    /// For how long, in nanoseconds.
+    #[prost(uint64, tag = "2")]
+    pub for_ns: u64,
 }
 /// What ended since the last report.
 #[derive(Clone, PartialEq, ::prost::Message)]
@@ -1369,6 +1385,21 @@ pub struct Report {
     /// Acknowledged by the application.
     #[prost(message, optional, tag = "5")]
     pub delivered: ::core::option::Option<Attempts>,
+    /// When the report left, by the node's clock in nanoseconds.
+    #[prost(uint64, tag = "6")]
+    pub sent_at_ns: u64,
+    /// When each was handed to its executor, in nanoseconds before `sent_at_ns`.
+    #[prost(uint64, repeated, tag = "7")]
+    pub executed_staged_ago_ns: ::prost::alloc::vec::Vec<u64>,
+    /// When each began to run, likewise.
+    #[prost(uint64, repeated, tag = "8")]
+    pub executed_started_ago_ns: ::prost::alloc::vec::Vec<u64>,
+    /// When each ended, likewise.
+    #[prost(uint64, repeated, tag = "9")]
+    pub executed_ended_ago_ns: ::prost::alloc::vec::Vec<u64>,
+    /// The sibling device each was taken from, plus one; zero for none. Empty if there is none at all.
+    #[prost(uint32, repeated, tag = "10")]
+    pub executed_stolen_from: ::prost::alloc::vec::Vec<u32>,
 }
 /// An execution that did not complete.
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]

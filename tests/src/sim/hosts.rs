@@ -116,6 +116,7 @@ impl WorkerHost {
                 certificate_der: Vec::new(),
             },
             max_jobs: self.max_jobs,
+            local_stealing: true,
             lottery_gain: 0.15,
             seed,
         }));
@@ -184,6 +185,7 @@ impl AppHost {
             name: format!("app-{index}"),
             weight: 1.0 + f64::from(u32::try_from(index).expect("few applications")),
             global_stealing,
+            policy: String::new(),
             resume: None,
         };
         Self {
@@ -241,6 +243,7 @@ impl World {
                     self.send(Proc::Coordinator, link, Message::CoordinatorToNode(message));
                 }
                 CoordinatorEffect::Close { link } => self.hang_up(Proc::Coordinator, link),
+                CoordinatorEffect::AskPolicy { plugin, .. } => panic!("nobody chose {plugin}"),
             }
         }
     }

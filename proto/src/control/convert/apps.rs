@@ -1,7 +1,7 @@
 //! Applications and the coordinator.
 
 use farm_core::{
-    id::{AppId, AppIncarnation, BatchId, Epoch, JobAttempt, NodeId, NodeSession, TaskId},
+    id::{AppId, AppIncarnation, BatchId, ContentHash, Epoch, JobAttempt, NodeId, NodeSession, TaskId},
     message::{
         AppHello, AppToCoordinator, CoordinatorToApp, CostNs, DevicePlan, NodePlan, Plan, PlanJob,
         PlanRequest, WaitReason,
@@ -60,6 +60,7 @@ impl From<AppHello> for v1::AppHello {
             weight: hello.weight,
             resume,
             global_stealing: hello.global_stealing,
+            policy: hello.policy,
         }
     }
 }
@@ -73,6 +74,7 @@ impl TryFrom<v1::AppHello> for AppHello {
             name: name("AppHello.name", wire.name)?,
             weight: weight("AppHello.weight", wire.weight)?,
             global_stealing: wire.global_stealing,
+            policy: name("AppHello.policy", wire.policy)?,
             resume: wire.resume.map(|was| (AppId(was.app), AppIncarnation(was.incarnation))),
         })
     }
@@ -88,6 +90,7 @@ impl From<PlanRequest> for v1::PlanRequest {
             cost_ns: cost_column(&request.jobs),
             needs: Some(request.needs.into()),
             contents: request.contents.into_iter().map(Into::into).collect(),
+            module: request.module.map_or_else(Vec::new, |module| module.0.to_vec()),
         }
     }
 }
@@ -124,8 +127,17 @@ impl TryFrom<v1::PlanRequest> for PlanRequest {
             jobs: jobs.collect::<Result<_, WireError>>()?,
             needs: required("PlanRequest.needs", wire.needs)?.try_into()?,
             contents: list("PlanRequest.contents", MAX_CONTENTS, wire.contents)?,
+            module: module(&wire.module)?,
         })
     }
+}
+
+fn module(wire: &[u8]) -> Result<Option<ContentHash>, WireError> {
+    if wire.is_empty() {
+        return Ok(None);
+    }
+    let hash = wire.try_into().map_err(|_| invalid("PlanRequest.module", format!("{} bytes", wire.len())))?;
+    Ok(Some(ContentHash(hash)))
 }
 
 impl From<CoordinatorToApp> for v1::CoordinatorToApp {

@@ -2,7 +2,11 @@
 
 use farm_core::{
     id::{AppId, Epoch, JobAttempt, NodeId, NodeSession, StealId},
-    message::{CoordinatorToNode, DeviceLoad, Executed, JobFailure, NodeHello, NodeToCoordinator},
+    message::{
+        CoordinatorToNode, DeviceLoad, Executed, JobFailure, JobTrace, NodeHello, NodeToCoordinator,
+        RunningJob,
+    },
+    time::Instant,
 };
 
 use super::{MAX_ENTRIES, WireError, cut, device, invalid, list, name, required, text, weight, within};
@@ -17,8 +21,8 @@ impl From<NodeToCoordinator> for v1::NodeToCoordinator {
                 let devices = devices.into_iter().map(Into::into).collect();
                 Message::Heartbeat(v1::NodeHeartbeat { sequence, devices, spool_bytes })
             }
-            NodeToCoordinator::Report { executed, delivered } => {
-                Message::Report(report(executed, &delivered))
+            NodeToCoordinator::Report { sent_at, executed, delivered } => {
+                Message::Report(report(sent_at, executed, &delivered))
             }
             NodeToCoordinator::DeviceLost { device, reason } => {
                 Message::DeviceLost(v1::DeviceLost { device: device.0.into(), reason: cut(reason) })
@@ -48,13 +52,18 @@ impl TryFrom<v1::NodeToCoordinator> for NodeToCoordinator {
                 within("NodeHeartbeat.devices", heartbeat.devices.len(), MAX_ENTRIES)?;
                 Self::Heartbeat {
                     sequence: heartbeat.sequence,
-                    devices: heartbeat.devices.into_iter().map(Into::into).collect(),
+                    devices: heartbeat
+                        .devices
+                        .into_iter()
+                        .map(TryInto::try_into)
+                        .collect::<Result<_, WireError>>()?,
                     spool_bytes: heartbeat.spool_bytes,
                 }
             }
             Message::Report(report) => {
                 let delivered = required("Report.delivered", report.delivered.clone())?.try_into()?;
-                Self::Report { executed: executed(report)?, delivered }
+                let sent_at = Instant(report.sent_at_ns);
+                Self::Report { sent_at, executed: executed(report)?, delivered }
             }
             Message::DeviceLost(lost) => Self::DeviceLost {
                 device: device("DeviceLost.device", lost.device)?,
@@ -101,29 +110,55 @@ impl TryFrom<v1::NodeHello> for NodeHello {
 
 impl From<DeviceLoad> for v1::DeviceLoad {
     fn from(load: DeviceLoad) -> Self {
-        Self { queued_jobs: load.queued_jobs, running_jobs: load.running_jobs }
+        let running = load.running.map(|running| v1::RunningJob {
+            job: Some([running.job].as_slice().into()),
+            for_ns: running.for_ns,
+        });
+        Self { queued_jobs: load.queued_jobs, running }
     }
 }
 
-impl From<v1::DeviceLoad> for DeviceLoad {
-    fn from(wire: v1::DeviceLoad) -> Self {
-        Self { queued_jobs: wire.queued_jobs, running_jobs: wire.running_jobs }
+impl TryFrom<v1::DeviceLoad> for DeviceLoad {
+    type Error = WireError;
+
+    fn try_from(wire: v1::DeviceLoad) -> Result<Self, WireError> {
+        let running = wire.running.map(|running| {
+            let jobs: Vec<JobAttempt> = required("RunningJob.job", running.job)?.try_into()?;
+            match jobs[..] {
+                [job] => Ok(RunningJob { job, for_ns: running.for_ns }),
+                _ => Err(invalid("RunningJob.job", format!("{} attempts", jobs.len()))),
+            }
+        });
+        Ok(Self { queued_jobs: wire.queued_jobs, running: running.transpose()? })
     }
 }
 
-fn report(executed: Vec<Executed>, delivered: &[JobAttempt]) -> v1::Report {
+fn report(sent_at: Instant, executed: Vec<Executed>, delivered: &[JobAttempt]) -> v1::Report {
     let jobs: Vec<JobAttempt> = executed.iter().map(|done| done.job).collect();
-    let executed_devices = executed.iter().map(|done| done.device.0.into()).collect();
-    let executed_device_time_ns = executed.iter().map(|done| done.device_time_ns).collect();
-    // A report of 2^32 executions would be over the message cap long before.
-    let failures = (0_u32..).zip(executed).filter_map(|(position, done)| {
-        Some(v1::ExecutedFailure { position, failure: Some(done.failure?.into()) })
-    });
+    let ago = |at: fn(&JobTrace) -> Instant| {
+        executed.iter().map(|done| sent_at.0.saturating_sub(at(&done.trace).0)).collect()
+    };
+    let stolen_from = |done: &Executed| done.trace.stolen_from.map_or(0, |device| u32::from(device.0) + 1);
+    let executed_stolen_from = match executed.iter().any(|done| done.trace.stolen_from.is_some()) {
+        true => executed.iter().map(stolen_from).collect(),
+        false => Vec::new(),
+    };
     v1::Report {
         executed: Some(jobs.as_slice().into()),
-        executed_devices,
-        executed_device_time_ns,
-        failures: failures.collect(),
+        executed_devices: executed.iter().map(|done| done.device.0.into()).collect(),
+        executed_device_time_ns: executed.iter().map(|done| done.device_time_ns).collect(),
+        sent_at_ns: sent_at.0,
+        executed_staged_ago_ns: ago(|trace| trace.staged_at),
+        executed_started_ago_ns: ago(|trace| trace.started_at),
+        executed_ended_ago_ns: ago(|trace| trace.ended_at),
+        executed_stolen_from,
+        // A report of 2^32 executions would be over the message cap long before.
+        failures: (0_u32..)
+            .zip(executed)
+            .filter_map(|(position, done)| {
+                Some(v1::ExecutedFailure { position, failure: Some(done.failure?.into()) })
+            })
+            .collect(),
         delivered: Some(delivered.into()),
     }
 }
@@ -134,21 +169,39 @@ fn executed(wire: v1::Report) -> Result<Vec<Executed>, WireError> {
     for (field, length) in [
         ("Report.executed_devices", wire.executed_devices.len()),
         ("Report.executed_device_time_ns", wire.executed_device_time_ns.len()),
+        ("Report.executed_staged_ago_ns", wire.executed_staged_ago_ns.len()),
+        ("Report.executed_started_ago_ns", wire.executed_started_ago_ns.len()),
+        ("Report.executed_ended_ago_ns", wire.executed_ended_ago_ns.len()),
     ] {
         if length != jobs.len() {
             return Err(invalid(field, format!("{length} entries for {} executions", jobs.len())));
         }
     }
+    if !(wire.executed_stolen_from.is_empty() || wire.executed_stolen_from.len() == jobs.len()) {
+        let found = format!("{} entries for {} executions", wire.executed_stolen_from.len(), jobs.len());
+        return Err(invalid("Report.executed_stolen_from", found));
+    }
+    let at = |ago: &[u64], position: usize| Instant(wire.sent_at_ns.saturating_sub(ago[position]));
     let mut failures = wire.failures.into_iter().peekable();
     let mut executed = Vec::with_capacity(jobs.len());
-    let columns = jobs.into_iter().zip(wire.executed_devices).zip(wire.executed_device_time_ns);
-    for (position, ((job, index), device_time_ns)) in (0_u32..).zip(columns) {
-        let failure = failures.next_if(|failure| failure.position == position).map(failure_of).transpose()?;
+    for (position, job) in jobs.into_iter().enumerate() {
+        let stolen_from = match wire.executed_stolen_from.get(position) {
+            None | Some(0) => None,
+            Some(beyond) => Some(device("Report.executed_stolen_from", beyond - 1)?),
+        };
+        let failed_here =
+            |failure: &v1::ExecutedFailure| usize::try_from(failure.position).is_ok_and(|at| at == position);
         executed.push(Executed {
             job,
-            device: device("Report.executed_devices", index)?,
-            device_time_ns,
-            failure,
+            device: device("Report.executed_devices", wire.executed_devices[position])?,
+            device_time_ns: wire.executed_device_time_ns[position],
+            trace: JobTrace {
+                staged_at: at(&wire.executed_staged_ago_ns, position),
+                started_at: at(&wire.executed_started_ago_ns, position),
+                ended_at: at(&wire.executed_ended_ago_ns, position),
+                stolen_from,
+            },
+            failure: failures.next_if(failed_here).map(failure_of).transpose()?,
         });
     }
     match failures.next() {
