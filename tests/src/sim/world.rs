@@ -1,226 +1,378 @@
-//! Virtual time, the in-memory network, and the event loop. Messages keep their order on a connection and lose it
-//! between connections; connections break loudly (both ends are told) or fall silent first.
+//! Virtual time and the event loop: what happens when, to which process.
 
 use std::{
     collections::{BTreeMap, BTreeSet},
-    fmt::Debug,
     time::Duration,
 };
 
 use farm_core::{
-    coordinator::{self, CoordinatorConfig, CoordinatorMachine},
-    id::{Epoch, LinkId, NodeId, NodeSession},
+    coordinator::CoordinatorMachine,
+    id::{DeviceIndex, LinkId, NodeId, NodeSession},
     ledger, message,
-    message::{
-        AppToCoordinator, AppToNode, CoordinatorToApp, CoordinatorToNode, NodeToApp, NodeToCoordinator,
-    },
     time::Instant,
     worker,
 };
 use rand::{Rng, SeedableRng, rngs::SmallRng};
 
-use crate::{
+use super::{
+    auditor::Auditor,
+    clock::Clock,
     faults::Fault,
-    hosts::{AppHost, Work, WorkerHost},
+    hosts::{AppHost, Store, WorkerHost},
+    log::Log,
+    lookout::Lookout,
+    network::{Distances, Duplicates, Link, Message, Proc},
+    work::Work,
 };
 
 /// Timers that fire this often at one instant do not get anywhere.
 const MAX_TIMER_ROUNDS: u32 = 1_000;
 
-/// Pause of a driver before it dials the coordinator again.
-const REDIAL: Duration = Duration::from_millis(50);
+/// Most that a clock is too fast or too slow, in parts per million: 10 %.
+const MAX_SKEW_PPM: u32 = 100_000;
 
-/// A process of the farm.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub(crate) enum Proc {
-    Coordinator,
-    Worker(usize),
-    App(usize),
-}
+const TRUE_RATE_PPM: u32 = 1_000_000;
 
-/// What a connection carries.
-#[derive(Clone, Debug)]
-pub(crate) enum Message {
-    AppToCoordinator(AppToCoordinator),
-    CoordinatorToApp(CoordinatorToApp),
-    NodeToCoordinator(NodeToCoordinator),
-    CoordinatorToNode(CoordinatorToNode),
-    AppToNode(AppToNode),
-    NodeToApp(NodeToApp),
-}
+/// Longest virtual time from the last fault to the last result (I12): unreachable pairs are believed for 60 s.
+pub const RECOVERY: Duration = Duration::from_secs(120);
+
+/// Longest virtual time from the last goodbye until nothing is kept (I8): a node that heard no goodbye waits 30 s for
+/// an announcement.
+pub const QUIET: Duration = Duration::from_secs(40);
+
+/// Virtual time of a millisecond, in nanoseconds.
+pub const MILLISECOND: u64 = 1_000_000;
 
 /// What happens at an instant.
 #[derive(Clone, Debug)]
-pub(crate) enum Happening {
+pub enum Happening {
     /// A message arrives at one end.
-    Arrives { link: LinkId, to: Proc, message: Message },
+    Arrives {
+        /// On which connection.
+        link: LinkId,
+        /// At whom.
+        to: Proc,
+        /// What.
+        message: Message,
+    },
     /// The dialler learns that its connection stands.
-    Opened { link: LinkId },
+    Opened {
+        /// Which.
+        link: LinkId,
+    },
+    /// The last word of an end that closed has arrived.
+    HungUp {
+        /// On which connection.
+        link: LinkId,
+    },
     /// One end learns that the connection is gone.
-    Closed { link: LinkId, to: Proc, life: u32 },
-    /// An application learns that a node could not be dialled.
-    NotOpened { app: usize, node: NodeId, session: NodeSession },
+    Closed {
+        /// Which.
+        link: LinkId,
+        /// Who learns it.
+        to: Proc,
+        /// In which life.
+        life: u32,
+    },
+    /// An application learns that it has no connection to a node.
+    NotOpened {
+        /// The application.
+        app: usize,
+        /// In which life.
+        life: u32,
+        /// The node.
+        node: NodeId,
+        /// In which life.
+        session: NodeSession,
+    },
     /// A process dials the coordinator.
-    Dial { proc: Proc, life: u32 },
+    Dial {
+        /// Who.
+        proc: Proc,
+        /// In which life.
+        life: u32,
+    },
     /// Something inside a worker's process.
-    Worker { worker: usize, life: u32, event: worker::Event },
+    Worker {
+        /// Which.
+        worker: usize,
+        /// In which life.
+        life: u32,
+        /// What.
+        event: worker::Event,
+    },
     /// A device's running job is done.
-    JobDone { worker: usize, life: u32, device: usize, run: u64 },
+    JobDone {
+        /// Whose device.
+        worker: usize,
+        /// In which life.
+        life: u32,
+        /// Which device.
+        device: DeviceIndex,
+        /// Which of the worker's runs.
+        run: u64,
+    },
     /// An application submits, cancels.
-    App { app: usize, event: ledger::Event },
+    App {
+        /// Which.
+        app: usize,
+        /// What.
+        event: ledger::Event,
+    },
     /// Something goes wrong.
     Fault(Fault),
 }
 
-/// A connection.
-#[derive(Debug)]
-struct Link {
-    dialler: Proc,
-    listener: Proc,
-    /// What the dialler calls it: `None` for the coordinator.
-    life: Option<(NodeId, NodeSession)>,
-    /// Messages vanish.
-    silent: bool,
-    /// Last arrival at the dialler and at the listener.
-    last_arrival: [Instant; 2],
+impl Happening {
+    /// Whether somebody is about to learn something from somebody else.
+    const fn is_news(&self) -> bool {
+        match self {
+            Self::Arrives { .. }
+            | Self::Opened { .. }
+            | Self::HungUp { .. }
+            | Self::Closed { .. }
+            | Self::NotOpened { .. }
+            | Self::Dial { .. } => true,
+            Self::Worker { .. } | Self::JobDone { .. } | Self::App { .. } | Self::Fault(_) => false,
+        }
+    }
 }
 
 /// How a farm is built.
 #[derive(Clone, Debug)]
-pub(crate) struct Setup {
-    pub(crate) seed: u64,
+pub struct Setup {
+    /// Of everything that is drawn.
+    pub seed: u64,
     /// Devices of each worker: speeds.
-    pub(crate) workers: Vec<Vec<f64>>,
-    pub(crate) apps: usize,
-    pub(crate) max_crashes: u32,
+    pub workers: Vec<Vec<f64>>,
+    /// Applications; the weight of each is its index plus one.
+    pub apps: usize,
+    /// Attempts that may end with their device or node before the job is poison.
+    pub max_crashes: u32,
     /// Most jobs on one worker.
-    pub(crate) max_jobs: usize,
+    pub max_jobs: usize,
     /// The applications allow it.
-    pub(crate) global_stealing: bool,
+    pub global_stealing: bool,
     /// Announced scores are wrong by up to this factor, either way.
-    pub(crate) score_error: f64,
+    pub score_error: f64,
+    /// Each process has a clock of its own.
+    pub skewed_clocks: bool,
+    /// How far apart processes are.
+    pub distances: Distances,
+}
+
+impl Setup {
+    /// A farm without trouble.
+    #[must_use]
+    pub fn calm(seed: u64, workers: Vec<Vec<f64>>, apps: usize) -> Self {
+        Self {
+            seed,
+            workers,
+            apps,
+            max_crashes: 3,
+            max_jobs: 10_000,
+            global_stealing: false,
+            score_error: 1.0,
+            skewed_clocks: false,
+            distances: Distances::Lan,
+        }
+    }
 }
 
 /// The farm.
-pub(crate) struct World {
-    pub(crate) now: Instant,
-    pub(crate) rng: SmallRng,
-    pub(crate) coordinator: CoordinatorMachine,
-    pub(crate) workers: Vec<WorkerHost>,
-    pub(crate) apps: Vec<AppHost>,
-    pub(crate) work: Work,
-    /// Application and worker that cannot reach each other.
-    pub(crate) cuts: BTreeSet<(usize, usize)>,
-    /// One in this many data messages arrives twice; 0 for none.
-    pub(crate) duplicate_one_in: u32,
-    max_crashes: u32,
-    max_jobs: usize,
-    score_error: f64,
-    epoch: u32,
-    links: BTreeMap<LinkId, Link>,
-    next_link: u64,
+#[derive(Debug)]
+pub struct World {
+    /// The world's time.
+    pub now: Instant,
+    /// Of everything that is drawn while the farm runs.
+    pub rng: SmallRng,
+    /// The coordinator's machine; while the process is down, that of its last life.
+    pub coordinator: CoordinatorMachine,
+    /// The workers' processes.
+    pub workers: Vec<WorkerHost>,
+    /// The applications' processes.
+    pub apps: Vec<AppHost>,
+    /// What jobs do.
+    pub work: Work,
+    /// Judges everything.
+    pub audit: Auditor,
+    pub(super) lookout: Lookout,
+    /// Everything that any machine wanted.
+    pub log: Log,
+    /// Application and worker that cannot reach each other, and are told so.
+    pub(super) cuts: BTreeSet<(usize, usize)>,
+    /// From whom to whom nothing gets through, and nobody is told.
+    pub(super) blocked: BTreeSet<(Proc, Proc)>,
+    pub(super) duplicates: Duplicates,
+    pub(super) distances: Distances,
+    pub(super) setup: Setup,
+    pub(super) store: Store,
+    pub(super) coordinator_up: bool,
+    pub(super) coordinator_clock: Clock,
+    pub(super) links: BTreeMap<LinkId, Link>,
+    pub(super) next_link: u64,
     queue: BTreeMap<(Instant, u64), Happening>,
     next_happening: u64,
+    /// Queued happenings that are news.
+    in_flight: u32,
+    /// When each process's machine wants to be woken, in the world's time.
+    timers: BTreeSet<(Instant, Proc)>,
+    armed: BTreeMap<Proc, Instant>,
     timer_rounds: u32,
-    /// FNV-1a over everything that any machine ever wanted.
-    pub(crate) log_hash: u64,
-    pub(crate) log_entries: u64,
 }
 
-pub(crate) const fn liveness() -> message::Liveness {
+/// Silences in the simulation: a tenth of the design's, so that a run of seconds sees each of them.
+#[must_use]
+pub const fn liveness() -> message::Liveness {
     message::Liveness { heartbeat_ms: 100, suspect_ms: 300, dead_ms: 1_000, reconnect_ms: 400 }
 }
 
-fn coordinator(epoch: u32, seed: u64, max_crashes: u32) -> CoordinatorMachine {
-    let config = CoordinatorConfig::new(Epoch(epoch), seed);
-    CoordinatorMachine::new(CoordinatorConfig {
-        liveness: liveness(),
-        app_lease_ms: 3_000,
-        max_crashes,
-        ..config
-    })
-}
-
 impl World {
-    pub(crate) fn new(setup: &Setup) -> Self {
+    /// A farm that is about to start.
+    #[must_use]
+    pub fn new(setup: Setup) -> Self {
+        let store = Store { epoch: 1 };
         let mut world = Self {
             now: Instant::ZERO,
             rng: SmallRng::seed_from_u64(setup.seed),
-            coordinator: coordinator(1, setup.seed, setup.max_crashes),
+            coordinator: store.coordinator(setup.seed, setup.max_crashes),
             workers: Vec::new(),
             apps: Vec::new(),
             work: Work::default(),
+            audit: Auditor::default(),
+            lookout: Lookout::default(),
+            log: Log::new(),
             cuts: BTreeSet::new(),
-            duplicate_one_in: 0,
-            max_crashes: setup.max_crashes,
-            max_jobs: setup.max_jobs,
-            score_error: setup.score_error,
-            epoch: 1,
+            blocked: BTreeSet::new(),
+            duplicates: Duplicates::Never,
+            distances: setup.distances,
+            store,
+            coordinator_up: true,
+            coordinator_clock: Clock::TRUE,
             links: BTreeMap::new(),
             next_link: 1,
             queue: BTreeMap::new(),
             next_happening: 0,
+            in_flight: 0,
+            timers: BTreeSet::new(),
+            armed: BTreeMap::new(),
             timer_rounds: 0,
-            log_hash: 0xcbf2_9ce4_8422_2325,
-            log_entries: 0,
+            setup,
         };
-        for speeds in &setup.workers {
-            world.add_worker(speeds);
+        world.coordinator_clock = world.new_clock();
+        for speeds in world.setup.workers.clone() {
+            world.add_worker(&speeds);
         }
-        for app in 0..setup.apps {
-            world.apps.push(AppHost::new(app, setup.global_stealing));
+        for app in 0..world.setup.apps {
+            let clock = world.new_clock();
+            world.apps.push(AppHost::new(app, world.setup.global_stealing, clock));
             world.after(Duration::ZERO, Happening::Dial { proc: Proc::App(app), life: 0 });
         }
         world
     }
 
-    pub(crate) fn add_worker(&mut self, speeds: &[f64]) {
+    /// One more worker starts.
+    pub fn add_worker(&mut self, speeds: &[f64]) {
         let index = self.workers.len();
         let seed = self.rng.random();
-        let bound = self.score_error;
+        let bound = self.setup.score_error;
         let errors = if bound > 1.0 {
             speeds.iter().map(|_| bound.powf(self.rng.random_range(-1.0..=1.0))).collect()
         } else {
             vec![1.0; speeds.len()]
         };
-        self.workers.push(WorkerHost::new(index, speeds, errors, self.max_jobs, seed));
+        let clock = self.new_clock();
+        let mut host = WorkerHost::new(index, speeds, errors, self.setup.max_jobs);
+        host.start(self.now, seed, clock);
+        self.workers.push(host);
         self.after(Duration::ZERO, Happening::Dial { proc: Proc::Worker(index), life: 0 });
     }
 
-    pub(crate) fn after(&mut self, delay: Duration, happening: Happening) {
+    /// Lets something happen after a while.
+    pub fn after(&mut self, delay: Duration, happening: Happening) {
         self.at(self.now.after(delay), happening);
     }
 
-    pub(crate) fn at(&mut self, at: Instant, happening: Happening) {
+    /// Lets something happen at a time, or now if that is over.
+    pub fn at(&mut self, at: Instant, happening: Happening) {
+        self.in_flight += u32::from(happening.is_news());
         self.queue.insert((at.max(self.now), self.next_happening), happening);
         self.next_happening += 1;
     }
 
-    /// Lets things happen until `done` says so. Panics if they have not by `deadline`.
-    pub(crate) fn run_until(&mut self, deadline: Instant, done: impl Fn(&Self) -> bool) {
+    /// Lets things happen until `done` says so.
+    ///
+    /// # Panics
+    /// It has not by `deadline` (I12), or an invariant is broken.
+    pub fn run_until(&mut self, deadline: Instant, done: impl Fn(&Self) -> bool) {
         while !done(self) {
-            assert!(self.now <= deadline, "not done by {deadline}: {}", self.describe());
+            assert!(self.now <= deadline, "I12: not done by {deadline}: {}", self.describe());
             self.step();
         }
     }
 
-    pub(crate) fn run_for(&mut self, duration: Duration) {
+    /// Lets things happen for a while.
+    ///
+    /// # Panics
+    /// An invariant is broken.
+    pub fn run_for(&mut self, duration: Duration) {
         let end = self.now.after(duration);
         while self.next_instant().is_some_and(|next| next <= end) {
             self.step();
         }
-        self.now = end;
+        self.advance(end);
+    }
+
+    /// The liveness mode: no fault follows, every application gets to its end and says goodbye, and nothing is kept.
+    ///
+    /// # Panics
+    /// A job does not end (I12), something is kept (I8), or another invariant is broken.
+    pub fn finish(&mut self) {
+        let deadline = self.now.after(RECOVERY);
+        self.run_until(deadline, |world| world.apps.iter().all(AppHost::is_done));
+        for app in 0..self.apps.len() {
+            if self.apps[app].is_up() {
+                self.app_event(app, ledger::Event::Finished);
+            }
+        }
+        let quiet = self.now.after(QUIET);
+        while !self.is_empty() && self.next_instant().is_some_and(|next| next <= quiet) {
+            self.step();
+        }
+        self.assert_empty();
+    }
+
+    /// Whether any message is on its way, or anybody about to learn of a connection.
+    #[must_use]
+    pub const fn is_quiet(&self) -> bool {
+        self.in_flight == 0
+    }
+
+    fn is_empty(&self) -> bool {
+        self.coordinator.status().apps.is_empty()
+            && self.workers.iter().filter(|host| host.is_up()).all(|host| host.kept() == 0)
+            && self.apps.iter().all(|host| host.kept() == 0)
+    }
+
+    /// I8: at quiescence nothing is kept.
+    fn assert_empty(&self) {
+        let apps = self.coordinator.status().apps;
+        assert!(apps.is_empty(), "I8: applications are kept: {}", self.describe());
+        self.workers.iter().filter(|host| host.is_up()).for_each(WorkerHost::assert_empty);
+        self.apps.iter().for_each(AppHost::assert_empty);
     }
 
     /// The earliest thing happens: a queued one before a timer of the same instant.
     fn step(&mut self) {
-        let timer = self.next_timer();
+        let timer = self.timers.first().copied();
         let queued = self.queue.first_key_value().map(|((at, _), _)| *at);
         match (queued, timer) {
-            (None, None) => panic!("nothing will ever happen again: {}", self.describe()),
+            (None, None) => panic!("I12: nothing will ever happen again: {}", self.describe()),
             (Some(at), timer) if timer.is_none_or(|(due, _)| at <= due) => {
                 let Some((_, happening)) = self.queue.pop_first() else { return };
+                // It is still on its way when the world is looked at.
                 self.advance(at);
+                self.in_flight -= u32::from(happening.is_news());
                 self.happen(happening);
             }
             (_, Some((due, proc))) => {
@@ -239,41 +391,50 @@ impl World {
 
     fn next_instant(&self) -> Option<Instant> {
         let queued = self.queue.first_key_value().map(|((at, _), _)| *at);
-        queued.into_iter().chain(self.next_timer().map(|(due, _)| due)).min()
-    }
-
-    fn next_timer(&self) -> Option<(Instant, Proc)> {
-        let coordinator = self.coordinator.poll_timeout().map(|due| (due, Proc::Coordinator));
-        let workers =
-            (0..).zip(&self.workers).filter_map(|(index, host)| Some((host.timeout()?, Proc::Worker(index))));
-        let apps = (0..)
-            .zip(&self.apps)
-            .filter_map(|(index, host)| Some((host.ledger.poll_timeout()?, Proc::App(index))));
-        coordinator.into_iter().chain(workers).chain(apps).min()
+        queued.into_iter().chain(self.timers.first().map(|(due, _)| *due)).min()
     }
 
     fn advance(&mut self, to: Instant) {
         if to > self.now {
             self.timer_rounds = 0;
+            self.look_around(to);
         }
         self.now = to;
     }
 
+    /// A machine may want to be woken at another time than before.
+    pub(super) fn rearm(&mut self, proc: Proc) {
+        let due = match proc {
+            Proc::Coordinator if !self.coordinator_up => None,
+            Proc::Coordinator => {
+                self.coordinator.poll_timeout().map(|due| self.coordinator_clock.reaches(due))
+            }
+            Proc::Worker(index) => self.workers[index].timeout(),
+            Proc::App(index) => self.apps[index].timeout(),
+        };
+        let before = match due {
+            Some(due) => self.armed.insert(proc, due),
+            None => self.armed.remove(&proc),
+        };
+        if before == due {
+            return;
+        }
+        if let Some(before) = before {
+            self.timers.remove(&(before, proc));
+        }
+        if let Some(due) = due {
+            self.timers.insert((due, proc));
+        }
+    }
+
     fn fire(&mut self, proc: Proc) {
-        let now = self.now;
         match proc {
             Proc::Coordinator => {
-                self.coordinator.handle_timeout(now);
+                self.coordinator.handle_timeout(self.coordinator_clock.shows(self.now));
                 self.coordinator_settles();
             }
-            Proc::Worker(index) => {
-                self.workers[index].machine_mut().handle_timeout(now);
-                self.worker_settles(index);
-            }
-            Proc::App(index) => {
-                self.apps[index].ledger.handle_timeout(now);
-                self.app_settles(index);
-            }
+            Proc::Worker(index) => self.worker_timeout(index),
+            Proc::App(index) => self.app_timeout(index),
         }
     }
 
@@ -281,9 +442,12 @@ impl World {
         match happening {
             Happening::Arrives { link, to, message } => self.arrives(link, to, message),
             Happening::Opened { link } => self.opened(link),
+            Happening::HungUp { link } => self.drop_link(link),
             Happening::Closed { link, to, life } => self.told_closed(link, to, life),
-            Happening::NotOpened { app, node, session } => {
-                self.app_event(app, ledger::Event::NodeLost { node, session });
+            Happening::NotOpened { app, life, node, session } => {
+                if self.apps[app].life == life {
+                    self.app_event(app, ledger::Event::NodeLost { node, session });
+                }
             }
             Happening::Dial { proc, life } => self.dial_coordinator(proc, life),
             Happening::Worker { worker, life, event } => {
@@ -301,222 +465,18 @@ impl World {
         }
     }
 
-    // ------------------------------------------------------------------ connections
-
-    fn dial_coordinator(&mut self, proc: Proc, life: u32) {
-        if self.life(proc) != life || !self.wants_coordinator(proc) {
-            return;
+    /// A clock for a process that starts now.
+    pub(super) fn new_clock(&mut self) -> Clock {
+        if !self.setup.skewed_clocks {
+            return Clock::TRUE;
         }
-        let link = self.add_link(proc, Proc::Coordinator, None);
-        self.after_latency(Happening::Opened { link });
+        let rate_ppm = self.rng.random_range(TRUE_RATE_PPM - MAX_SKEW_PPM..=TRUE_RATE_PPM + MAX_SKEW_PPM);
+        Clock::started(self.now, rate_ppm)
     }
 
-    /// An application dials a node.
-    pub(crate) fn dial_node(&mut self, app: usize, node: NodeId, session: NodeSession, address: &str) {
-        let index: usize = address.trim_start_matches("worker-").parse().expect("addresses are ours");
-        let reachable = self.workers[index].session == session && self.workers[index].is_up();
-        if !reachable || self.cuts.contains(&(app, index)) {
-            self.after_latency(Happening::NotOpened { app, node, session });
-            return;
-        }
-        let link = self.add_link(Proc::App(app), Proc::Worker(index), Some((node, session)));
-        self.after_latency(Happening::Opened { link });
-    }
-
-    fn add_link(&mut self, dialler: Proc, listener: Proc, life: Option<(NodeId, NodeSession)>) -> LinkId {
-        let id = LinkId(self.next_link);
-        self.next_link += 1;
-        self.links.insert(id, Link { dialler, listener, life, silent: false, last_arrival: [self.now; 2] });
-        id
-    }
-
-    fn opened(&mut self, id: LinkId) {
-        let Some(link) = self.links.get(&id) else { return };
-        match (link.dialler, link.life) {
-            (Proc::Worker(index), _) => {
-                self.workers[index].control = Some(id);
-                self.worker_event(index, worker::Event::CoordinatorConnected);
-            }
-            (Proc::App(index), None) => {
-                self.apps[index].control = Some(id);
-                self.app_event(index, ledger::Event::CoordinatorConnected);
-            }
-            (Proc::App(index), Some((node, session))) => {
-                self.apps[index].nodes.insert((node, session), id);
-                self.app_event(index, ledger::Event::NodeConnected { node, session });
-            }
-            (Proc::Coordinator, _) => panic!("the coordinator dials nobody"),
-        }
-    }
-
-    pub(crate) fn send(&mut self, from: Proc, id: LinkId, message: Message) {
-        let may_double = matches!(
-            message,
-            Message::AppToNode(AppToNode::Jobs(_)) | Message::NodeToApp(NodeToApp::Result(_))
-        );
-        let one_in = self.duplicate_one_in;
-        let copies = if may_double && one_in > 0 && self.rng.random_ratio(1, one_in) { 2 } else { 1 };
-        for _ in 0..copies {
-            let latency = self.latency();
-            let Some(link) = self.links.get_mut(&id).filter(|link| !link.silent) else { return };
-            let (to, side) = if link.dialler == from { (link.listener, 1) } else { (link.dialler, 0) };
-            let arrival = self.now.after(latency).max(link.last_arrival[side]);
-            link.last_arrival[side] = arrival;
-            self.at(arrival, Happening::Arrives { link: id, to, message: message.clone() });
-        }
-    }
-
-    fn arrives(&mut self, id: LinkId, to: Proc, message: Message) {
-        let Some(link) = self.links.get(&id).filter(|link| !link.silent) else { return };
-        let life = link.life;
-        match (to, message) {
-            (Proc::Coordinator, Message::AppToCoordinator(message)) => {
-                self.coordinator_event(coordinator::Event::FromApp { link: id, message });
-            }
-            (Proc::Coordinator, Message::NodeToCoordinator(message)) => {
-                self.coordinator_event(coordinator::Event::FromNode { link: id, message });
-            }
-            (Proc::Worker(index), Message::CoordinatorToNode(message)) => {
-                self.worker_event(index, worker::Event::FromCoordinator(message));
-            }
-            (Proc::Worker(index), Message::AppToNode(message)) => self.worker_hears_app(index, id, message),
-            (Proc::App(index), Message::CoordinatorToApp(message)) => {
-                self.app_event(index, ledger::Event::FromCoordinator(message));
-            }
-            (Proc::App(index), Message::NodeToApp(message)) => {
-                let (node, session) = life.expect("nodes speak on data links");
-                self.app_hears_node(index, node, session, message);
-            }
-            (to, message) => panic!("{to:?} cannot hear {message:?}"),
-        }
-    }
-
-    /// A connection breaks: what is on its way is lost, both ends learn of it, each in its time.
-    pub(crate) fn break_link(&mut self, id: LinkId) {
-        let Some(link) = self.links.remove(&id) else { return };
-        for to in [link.dialler, link.listener] {
-            if let (Proc::App(index), Some(life)) = (to, link.life) {
-                let current = self.apps[index].nodes.get(&life) == Some(&id);
-                if current {
-                    self.apps[index].nodes.remove(&life);
-                    let (node, session) = life;
-                    self.after_latency(Happening::NotOpened { app: index, node, session });
-                }
-                continue;
-            }
-            let life = self.life(to);
-            self.after_latency(Happening::Closed { link: id, to, life });
-        }
-    }
-
-    /// One end closes: what it said before still arrives.
-    pub(crate) fn hang_up(&mut self, from: Proc, id: LinkId) {
-        let Some(link) = self.links.get(&id) else { return };
-        let side = usize::from(link.dialler == from);
-        let last_word = link.last_arrival[side];
-        self.at(last_word, Happening::Fault(Fault::Break(id)));
-    }
-
-    fn told_closed(&mut self, id: LinkId, to: Proc, life: u32) {
-        if self.life(to) != life {
-            return;
-        }
-        match to {
-            Proc::Coordinator => self.coordinator_event(coordinator::Event::LinkClosed { link: id }),
-            Proc::Worker(index) if self.workers[index].control == Some(id) => {
-                self.workers[index].control = None;
-                self.worker_event(index, worker::Event::CoordinatorLost);
-                self.after(REDIAL, Happening::Dial { proc: to, life });
-            }
-            // Dialled, and broken before it opened.
-            Proc::Worker(index) if self.workers[index].control.is_none() => {
-                self.after(REDIAL, Happening::Dial { proc: to, life });
-                self.worker_event(index, worker::Event::AppLinkClosed { link: id });
-            }
-            Proc::Worker(index) => self.worker_event(index, worker::Event::AppLinkClosed { link: id }),
-            Proc::App(index) => {
-                self.apps[index].control = None;
-                self.app_event(index, ledger::Event::CoordinatorLost);
-                self.after(REDIAL, Happening::Dial { proc: to, life });
-            }
-        }
-    }
-
-    pub(crate) fn silence_link(&mut self, id: LinkId) {
-        if let Some(link) = self.links.get_mut(&id) {
-            link.silent = true;
-        }
-    }
-
-    pub(crate) fn links_of(&self, proc: Proc) -> Vec<LinkId> {
-        let ends = |link: &Link| link.dialler == proc || link.listener == proc;
-        self.links.iter().filter(|(_, link)| ends(link)).map(|(&id, _)| id).collect()
-    }
-
-    pub(crate) fn links_between(&self, one: Proc, other: Proc) -> Vec<LinkId> {
-        let between = |link: &Link| (link.dialler, link.listener) == (one, other);
-        self.links.iter().filter(|(_, link)| between(link)).map(|(&id, _)| id).collect()
-    }
-
-    pub(crate) fn any_link(&mut self) -> Option<LinkId> {
-        if self.links.is_empty() {
-            return None;
-        }
-        let nth = self.rng.random_range(0..self.links.len());
-        self.links.keys().nth(nth).copied()
-    }
-
-    pub(crate) fn is_open(&self, id: LinkId) -> bool {
-        self.links.get(&id).is_some_and(|link| !link.silent)
-    }
-
-    /// The coordinator's process dies and another one, which knows nothing, takes its address.
-    pub(crate) fn restart_coordinator(&mut self) {
-        for link in self.links_of(Proc::Coordinator) {
-            self.break_link(link);
-        }
-        self.epoch += 1;
-        self.coordinator = coordinator(self.epoch, self.epoch.into(), self.max_crashes);
-    }
-
-    // ------------------------------------------------------------------ small things
-
-    fn latency(&mut self) -> Duration {
-        Duration::from_micros(self.rng.random_range(50..5_000))
-    }
-
-    fn after_latency(&mut self, happening: Happening) {
-        let latency = self.latency();
-        self.after(latency, happening);
-    }
-
-    fn life(&self, proc: Proc) -> u32 {
-        match proc {
-            Proc::Coordinator => self.epoch,
-            Proc::Worker(index) => self.workers[index].life,
-            Proc::App(_) => 0,
-        }
-    }
-
-    fn wants_coordinator(&self, proc: Proc) -> bool {
-        let control = match proc {
-            Proc::Coordinator => return false,
-            Proc::Worker(index) if !self.workers[index].is_up() => return false,
-            Proc::Worker(index) => self.workers[index].control,
-            Proc::App(index) if self.apps[index].finished => return false,
-            Proc::App(index) => self.apps[index].control,
-        };
-        control.is_none() && self.links_between(proc, Proc::Coordinator).is_empty()
-    }
-
-    pub(crate) fn log(&mut self, proc: Proc, effect: &impl Debug) {
-        self.log_entries += 1;
-        for byte in format!("{} {proc:?} {effect:?}", self.now).bytes() {
-            self.log_hash = (self.log_hash ^ u64::from(byte)).wrapping_mul(0x0100_0000_01b3);
-        }
-    }
-
-    pub(crate) fn describe(&self) -> String {
+    /// Where everything stands, for people.
+    #[must_use]
+    pub fn describe(&self) -> String {
         let ledgers: Vec<_> = self.apps.iter().map(|host| host.ledger.counts()).collect();
         format!("at {}: {ledgers:#?}\n{:#?}", self.now, self.coordinator.status())
     }
