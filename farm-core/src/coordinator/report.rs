@@ -86,7 +86,7 @@ impl CoordinatorMachine {
     fn device_freed(&mut self, id: NodeId, job: JobAttempt) -> Option<u64> {
         let record = self.job_mut(job.job)?;
         let JobState::Placed(place) = record.state else { return None };
-        record.state = JobState::Executed { node: id, attempt: job.attempt };
+        record.state = JobState::Executed { node: id, device: place.device, attempt: job.attempt };
         let device = self.nodes.get_mut(&id)?.device_mut(place.device)?;
         device.drop_load(place.load_ns);
         Some(place.load_ns)
