@@ -266,9 +266,12 @@ impl Auditor {
         self.jobs.iter().map(|(&job, record)| (job, record.executions))
     }
 
-    /// Whether a job was ever stolen: it may have to stay where it is.
-    pub(super) fn was_stolen(&self, job: JobId) -> bool {
-        self.jobs.get(&job).is_none_or(|record| record.steals > 0)
+    /// Whether an attempt is its job's last one, and may leave the node it is on: a stolen job may have to stay, and of a
+    /// superseded attempt nobody knows.
+    pub(super) fn may_move(&self, job: JobAttempt) -> bool {
+        self.jobs.get(&job.job).is_some_and(|record| {
+            record.steals == 0 && record.newest.is_some_and(|(newest, _)| newest == job.attempt)
+        })
     }
 
     fn app_of(&self, job: JobId) -> Option<Proc> {

@@ -187,7 +187,7 @@ impl World {
             .iter()
             .map(|host| {
                 let speed: f64 = host.well_devices().map(|(_, speed, _)| speed).sum();
-                let movable = host.queued().filter(|job| !self.audit.was_stolen(job.job));
+                let movable = host.queued().filter(|job| self.audit.may_move(*job));
                 let work_ns: u64 = movable.map(|job| cost_ns(job.job.index)).sum();
                 stealing && !host.leaves() && host.is_well() && work_ns as f64 / 1e9 > least_s * speed
             })
