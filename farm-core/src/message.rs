@@ -138,6 +138,8 @@ pub struct NodePlan {
 pub struct Plan {
     /// The request answered; `None` when the coordinator re-plans on its own.
     pub batch: Option<BatchId>,
+    /// The jobs run elsewhere already and go on there: these attempts are in addition, and the first result counts.
+    pub speculative: bool,
     /// Grouped by node.
     pub nodes: Vec<NodePlan>,
 }

@@ -171,8 +171,11 @@ fn coordinator_to_app() -> impl Strategy<Value = CoordinatorToApp> {
             devices,
         },
     );
-    let plan = (option::of(any::<u64>()), vec(node_plan, 0..4))
-        .prop_map(|(batch, nodes)| CoordinatorToApp::Plan(Plan { batch: batch.map(BatchId), nodes }));
+    let plan = (option::of(any::<u64>()), any::<bool>(), vec(node_plan, 0..4)).prop_map(
+        |(batch, speculative, nodes)| {
+            CoordinatorToApp::Plan(Plan { batch: batch.map(BatchId), speculative, nodes })
+        },
+    );
     let reason = prop::sample::select(vec![WaitReason::NoNode, WaitReason::NoFittingDevice]);
     prop_oneof![
         (any::<(u64, u32, u32)>(), liveness()).prop_map(|((app, life, epoch), liveness)| {
@@ -306,15 +309,18 @@ fn farm_status() -> impl Strategy<Value = FarmStatus> {
             device_time_ns: counts[3],
         },
     );
-    (any::<(u32, u64, u64)>(), vec(node, 0..4), vec(app, 0..4)).prop_map(
-        |((epoch, delivered, replanned), nodes, apps)| FarmStatus {
+    (any::<(u32, [u64; 5])>(), vec(node, 0..4), vec(app, 0..4)).prop_map(|((epoch, counts), nodes, apps)| {
+        FarmStatus {
             epoch: Epoch(epoch),
             nodes,
             apps,
-            delivered_jobs: delivered,
-            replanned_jobs: replanned,
-        },
-    )
+            delivered_jobs: counts[0],
+            replanned_jobs: counts[1],
+            stolen_jobs: counts[2],
+            speculations: counts[3],
+            policy_fallbacks: counts[4],
+        }
+    })
 }
 
 proptest! {
@@ -495,7 +501,8 @@ fn a_plan_of_4096_jobs_is_small() {
         contact,
         devices: vec![DevicePlan { device: DeviceIndex(0), jobs: jobs.collect() }],
     };
-    let plan = CoordinatorToApp::Plan(Plan { batch: Some(BatchId(1)), nodes: vec![node] });
+    let plan =
+        CoordinatorToApp::Plan(Plan { batch: Some(BatchId(1)), speculative: false, nodes: vec![node] });
     let bytes = v1::CoordinatorToApp::from(plan).encoded_len();
     assert!(bytes < 9_000, "{bytes} B for 4,096 jobs");
     let request = PlanRequest {

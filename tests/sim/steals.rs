@@ -36,8 +36,10 @@ fn makespan_ratio(seed: u64, jobs: u32, global_stealing: bool) -> f64 {
     world.run_until(deadline, |world| world.apps[0].is_done());
     let took = world.now.since(begin).as_secs_f64();
     assert!(all_delivered(&world), "{}", world.describe());
-    assert!(each_ran_once(&world), "I5: a steal executes nothing twice");
-    assert_eq!(world.coordinator.stolen_jobs() > 0, global_stealing, "only where it is allowed");
+    let executions: u64 = world.audit.executions().map(|(_, executions)| u64::from(executions)).sum();
+    let second_attempts = world.coordinator.status().speculations;
+    assert!(executions <= u64::from(jobs) + second_attempts, "I5: a steal executes nothing twice");
+    assert_eq!(world.coordinator.status().stolen_jobs > 0, global_stealing, "only where it is allowed");
     let work_ns: u64 = (0..jobs).map(|index| cost_ns(JobIndex(index))).sum();
     let speed: f64 = (0..NODES).map(speed).sum();
     took * speed / (work_ns as f64 / 1e9)
@@ -87,7 +89,7 @@ fn without_consent_nothing_moves_between_nodes_that_are_there() {
     world.run_for(Duration::from_millis(200));
     world.submit(200, 0, 0, 1_000);
     world.finish();
-    assert_eq!(world.coordinator.stolen_jobs(), 0, "not allowed");
+    assert_eq!(world.coordinator.status().stolen_jobs, 0, "not allowed");
 }
 
 #[test]

@@ -241,7 +241,7 @@ mod tests {
         runs.waits(BatchId(1), TaskId(0), WaitReason::NoNode, start);
         runs.waits(BatchId(2), TaskId(1), WaitReason::NoNode, start);
         runs.waits(BatchId(2), TaskId(1), WaitReason::NoFittingDevice, start + Duration::from_secs(30));
-        runs.planned(&Plan { batch: Some(BatchId(1)), nodes: Vec::new() });
+        runs.planned(&Plan { batch: Some(BatchId(1)), speculative: false, nodes: Vec::new() });
         assert_eq!(runs.waiting(), Some(WaitReason::NoFittingDevice));
         assert_eq!(
             runs.next_wake(),
@@ -283,7 +283,7 @@ mod tests {
             let devices = vec![DevicePlan { device: DeviceIndex(0), jobs: vec![job] }];
             let contact = Contact { addresses: Vec::new(), certificate_der: Vec::new() };
             let node = NodePlan { node: NodeId(1), session: NodeSession(1), contact, devices };
-            Plan { batch: None, nodes: vec![node] }
+            Plan { batch: None, speculative: false, nodes: vec![node] }
         };
         runs.planned(&unasked(1, 3));
         assert_eq!(runs.waits.len(), 2, "another task's plan says nothing");

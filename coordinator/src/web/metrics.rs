@@ -20,6 +20,25 @@ pub(super) fn render(status: &FarmStatus) -> String {
     page.sample("gleaner_jobs_total", &[("outcome", &"delivered")], status.delivered_jobs);
     page.sample("gleaner_jobs_total", &[("outcome", &"replanned")], status.replanned_jobs);
 
+    page.family(
+        "gleaner_stolen_jobs_total",
+        "counter",
+        "Jobs moved between nodes by stealing since this start.",
+    );
+    page.sample("gleaner_stolen_jobs_total", &[], status.stolen_jobs);
+    page.family(
+        "gleaner_speculations_total",
+        "counter",
+        "Second attempts beside running ones since this start.",
+    );
+    page.sample("gleaner_speculations_total", &[], status.speculations);
+    page.family(
+        "gleaner_policy_fallbacks_total",
+        "counter",
+        "Batches placed first come, first served since this start because a plug-in failed.",
+    );
+    page.sample("gleaner_policy_fallbacks_total", &[], status.policy_fallbacks);
+
     page.family("gleaner_jobs", "gauge", "Jobs of the registered applications by state.");
     let waiting: u64 = status.apps.iter().map(|app| app.waiting_jobs).sum();
     let outstanding: u64 = status.apps.iter().map(|app| app.outstanding_jobs).sum();

@@ -99,6 +99,9 @@ pub(crate) mod samples {
             apps: vec![app],
             delivered_jobs: 40,
             replanned_jobs: 6,
+            stolen_jobs: 7,
+            speculations: 8,
+            policy_fallbacks: 9,
         }
     }
 }

@@ -31,10 +31,11 @@ fn write_body(page: &mut String, status: &FarmStatus) -> fmt::Result {
     let devices = status.nodes.iter().map(|node| node.devices.len()).sum::<usize>();
     writeln!(
         page,
-        "<h1>Gleaner</h1><p>{} nodes, {devices} devices, {} applications; {} jobs delivered, {} replanned; {}.</p>",
+        "<h1>Gleaner</h1><p>{} nodes, {devices} devices, {} applications; {} jobs delivered, {} stolen, {} replanned; {}.</p>",
         status.nodes.len(),
         status.apps.len(),
         status.delivered_jobs,
+        status.stolen_jobs,
         status.replanned_jobs,
         status.epoch
     )?;

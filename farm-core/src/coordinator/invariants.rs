@@ -5,6 +5,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use super::{
     CoordinatorMachine,
     model::{JobState, Peer},
+    rates::Module,
     steal::MAX_STEALS,
 };
 use crate::id::{AppId, DeviceIndex, JobKey};
@@ -21,6 +22,7 @@ impl CoordinatorMachine {
         self.check_books();
         self.check_queue();
         self.check_steals();
+        self.check_backups();
     }
 
     fn check_links(&self) {
@@ -64,24 +66,26 @@ impl CoordinatorMachine {
 
     fn check_books(&self) {
         for (id, node) in &self.nodes {
-            let mut loads: BTreeMap<DeviceIndex, (u128, u64)> = BTreeMap::new();
+            let mut loads: BTreeMap<DeviceIndex, (BTreeMap<Module, u128>, u64)> = BTreeMap::new();
             for job in &node.jobs {
                 let state = self
                     .apps
                     .get(&job.app)
                     .and_then(|app| app.jobs.get(&JobKey::of(*job)))
                     .map(|job| job.state);
+                let backup = self.backups.get(job).copied().filter(|backup| backup.node == *id);
+                let state = backup.map(JobState::Placed).or(state);
                 let held = state.and_then(JobState::holder).map(|(node, _)| node);
                 assert_eq!(held, Some(*id), "I1: {id} has {job} on its books, which is elsewhere");
                 if let Some(JobState::Placed(place)) = state {
-                    let (queued_ns, jobs) = loads.entry(place.device).or_default();
-                    *queued_ns += u128::from(place.load_ns);
+                    let (queued, jobs) = loads.entry(place.device).or_default();
+                    *queued.entry(place.load.module).or_default() += u128::from(place.load.amount);
                     *jobs += 1;
                 }
             }
             for (index, device) in (0_u16..).zip(&node.devices) {
                 let expected = loads.remove(&DeviceIndex(index)).unwrap_or_default();
-                let booked = (device.queued_ns, device.planned_jobs);
+                let booked = (device.throughput.queued().collect(), device.planned_jobs);
                 assert_eq!(booked, expected, "load of {id} {}", DeviceIndex(index));
             }
             assert!(loads.is_empty(), "{id} holds jobs of devices it does not have");
@@ -119,7 +123,8 @@ impl CoordinatorMachine {
     /// I1: each waiting job is in line once.
     fn check_queue(&self) {
         let mut queued: BTreeSet<(AppId, JobKey)> = BTreeSet::new();
-        for pending in &self.stuck {
+        let asked = self.questions.values().map(|asked| &asked.pending);
+        for pending in self.stuck.iter().chain(asked) {
             let Some(app) = self.apps.get(&pending.app) else {
                 panic!("I8: jobs of {}, which left, are in line", pending.app)
             };

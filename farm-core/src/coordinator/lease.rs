@@ -50,6 +50,7 @@ impl CoordinatorMachine {
         self.expire_nodes(now);
         self.expire_apps(now);
         self.expire_steals(now);
+        self.expire_questions(now);
     }
 
     /// Finds the next deadline.
@@ -67,7 +68,8 @@ impl CoordinatorMachine {
             [Some(lease), app.unreachable.values().min().copied()]
         });
         let steals = self.steals.values().map(|steal| Some(steal.answer_by));
-        self.wake = nodes.chain(apps).chain(steals).flatten().min();
+        let questions = self.questions.values().map(|asked| Some(asked.answer_by));
+        self.wake = nodes.chain(apps).chain(steals).chain(questions).flatten().min();
     }
 
     fn expire_nodes(&mut self, now: Instant) {

@@ -3,18 +3,21 @@
 //! It owns plans, load and fairness; it never owns job payloads, sockets or clocks. A driver feeds events by connection
 //! ([`LinkId`]) and carries the effects out.
 //!
-//! Split by event family: `registry` (who is there), `placement` (where jobs go), `report` (what ended), `replan` (what
-//! was lost), `steal` (what moves between nodes), `lease` (who is silent), `status` (what operators see). `model` holds
-//! the state they share.
+//! Split by event family: `registry` (who is there), `placement` (where jobs go, by a `policy`; `consult` asks plug-ins),
+//! `report` (what ended), `replan` (what was lost), `steal` (what moves between nodes), `speculate` (what runs twice at the tail), `lease` (who is silent), `status`
+//! (what operators see). `model` holds the state they share, `rates` what devices are worth.
 
+mod consult;
 mod invariants;
 mod lease;
 mod model;
 mod placement;
 pub mod policy;
+mod rates;
 mod registry;
 mod replan;
 mod report;
+mod speculate;
 mod status;
 mod steal;
 
@@ -23,13 +26,15 @@ use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use serde::{Deserialize, Serialize};
 
 use self::{
-    model::{App, Calibration, Node, Peer, Pending},
-    policy::{Choice, Question, QuestionId},
-    steal::Steal,
+    consult::{Asked, PluginFaults},
+    model::{App, Node, Peer, Pending, Placement},
+    policy::{Choice, History, Question, QuestionId},
+    rates::Modules,
+    steal::{Steal, StealLatency},
 };
 use crate::{
     device::DeviceKind,
-    id::{AppId, Attempt, BatchId, DeviceIndex, Epoch, JobKey, LinkId, NodeId, StealId},
+    id::{AppId, Attempt, BatchId, DeviceIndex, Epoch, JobId, JobKey, LinkId, NodeId, StealId},
     message::{AppToCoordinator, CoordinatorToApp, CoordinatorToNode, Liveness, NodeToCoordinator},
     time::Instant,
 };
@@ -233,6 +238,12 @@ pub struct FarmStatus {
     pub delivered_jobs: u64,
     /// New attempts after a loss since this start.
     pub replanned_jobs: u64,
+    /// Jobs moved between nodes by stealing since this start.
+    pub stolen_jobs: u64,
+    /// Second attempts beside running ones since this start.
+    pub speculations: u64,
+    /// Batches placed first come, first served since this start because a plug-in failed.
+    pub policy_fallbacks: u64,
 }
 
 /// The coordinator.
@@ -248,21 +259,31 @@ pub struct CoordinatorMachine {
     next_app: u32,
     next_node: u32,
     next_attempt: u64,
-    calibration: Calibration,
+    modules: Modules,
+    history: History,
     /// Jobs to be placed before the current event is done with, first come, first served.
     fresh: VecDeque<Pending>,
     /// Jobs that no device can take now, first come, first served; tried again when that may have changed.
     stuck: VecDeque<Pending>,
+    /// Batches that a plug-in was asked about.
+    questions: BTreeMap<QuestionId, Asked>,
+    next_question: u64,
+    plugin_faults: BTreeMap<String, PluginFaults>,
     /// Jobs that lost their place during the current event.
     lost: BTreeMap<(AppId, BatchId), Vec<JobKey>>,
     /// Retract orders without an answer; at most one for each thief.
     steals: BTreeMap<StealId, Steal>,
     next_steal: u64,
+    steal_latency: StealLatency,
     /// No later than the earliest deadline.
     wake: Option<Instant>,
     delivered_jobs: u64,
     replanned_jobs: u64,
     stolen_jobs: u64,
+    policy_fallbacks: u64,
+    /// Attempts beside those that the jobs' states name.
+    backups: BTreeMap<JobId, Placement>,
+    speculations: u64,
     effects: VecDeque<Effect>,
 }
 
@@ -279,16 +300,24 @@ impl CoordinatorMachine {
             next_app: 1,
             next_node: 1,
             next_attempt: 1,
-            calibration: Calibration::default(),
+            modules: Modules::default(),
+            history: History::default(),
             fresh: VecDeque::new(),
             stuck: VecDeque::new(),
+            questions: BTreeMap::new(),
+            next_question: 1,
+            plugin_faults: BTreeMap::new(),
             lost: BTreeMap::new(),
             steals: BTreeMap::new(),
             next_steal: 1,
+            steal_latency: StealLatency::default(),
             wake: None,
             delivered_jobs: 0,
             replanned_jobs: 0,
             stolen_jobs: 0,
+            policy_fallbacks: 0,
+            backups: BTreeMap::new(),
+            speculations: 0,
             effects: VecDeque::new(),
         }
     }
@@ -312,8 +341,10 @@ impl CoordinatorMachine {
                 self.drain(node);
                 None
             }
-            // Nothing was asked.
-            Event::PolicyAnswered { .. } => None,
+            Event::PolicyAnswered { question, answer } => {
+                self.policy_answered(now, question, answer);
+                None
+            }
         };
         self.place_pending(now);
         match speaker {
@@ -377,6 +408,7 @@ impl CoordinatorMachine {
             NodeToCoordinator::Hello(_) => self.protocol_error(now, link),
             NodeToCoordinator::Heartbeat { sequence, devices, spool_bytes: _ } => {
                 self.loads_reported(node, &devices);
+                self.consider_speculating(now, node);
                 self.tell_node(node, CoordinatorToNode::HeartbeatAck { sequence });
             }
             NodeToCoordinator::Report { sent_at: _, executed, delivered } => {

@@ -3,24 +3,25 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use super::NodeState;
+use super::{
+    NodeState,
+    policy::Policy,
+    rates::{Load, Module, Modules, Throughput},
+};
 use crate::{
     device::{DeviceInfo, Requirements},
     id::{
-        AppId, AppIncarnation, Attempt, BatchId, DeviceIndex, JobId, JobKey, LinkId, NodeId, NodeSession,
-        StealId,
+        AppId, AppIncarnation, Attempt, BatchId, ContentHash, DeviceIndex, JobId, JobKey, LinkId, NodeId,
+        NodeSession, StealId, TaskId,
     },
-    message::{Contact, CostNs, JobFailure, WaitReason},
+    message::{Contact, CostNs, JobFailure, NodeHello, RunningJob, WaitReason},
+    program::Content,
     time::Instant,
 };
 
-/// Weight of a new throughput sample in a device's rate. 0.2 follows a change of speed within ten jobs and lets one
-/// outlier move the rate by a fifth at most of its (bounded) distance.
-const RATE_GAIN: f64 = 0.2;
-
-/// A sample counts as at most this many times faster or slower than the rate so far: one warm-up launch or one job of
-/// wrong cost must not starve or flood a device.
-const MAX_RATE_STEP: f64 = 16.0;
+/// Most contents that a node is remembered to hold; beyond it the smallest hashes are forgotten: the node is then taken
+/// for colder than it is.
+const MAX_KNOWN_CONTENTS: usize = 4_096;
 
 /// Who is at the other end of a connection.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -36,6 +37,7 @@ pub(super) struct App {
     pub(super) weight: f64,
     /// Its queued jobs may be moved to balance nodes.
     pub(super) global_stealing: bool,
+    pub(super) policy: Policy,
     pub(super) incarnation: AppIncarnation,
     /// `None` while it is away; then `lease_until` runs.
     pub(super) link: Option<LinkId>,
@@ -66,7 +68,11 @@ impl App {
 /// What the jobs of one plan request share.
 #[derive(Debug)]
 pub(super) struct Batch {
+    pub(super) task: TaskId,
     pub(super) needs: Requirements,
+    pub(super) module: Module,
+    /// What a node needs to have before it can run them.
+    pub(super) contents: Vec<Content>,
     /// Its jobs in [`App::jobs`].
     pub(super) open_jobs: u32,
     /// The reason for waiting that the application was told last.
@@ -116,8 +122,7 @@ pub(super) struct Placement {
     pub(super) device: DeviceIndex,
     pub(super) attempt: Attempt,
     pub(super) planned_at: Instant,
-    /// What the job adds to the device's queue.
-    pub(super) load_ns: u64,
+    pub(super) load: Load,
     /// The steal that asks its node to give it up.
     pub(super) retracting: Option<StealId>,
 }
@@ -149,6 +154,8 @@ pub(super) struct Node {
     pub(super) recheck: Option<Recheck>,
     /// Jobs placed or executed here.
     pub(super) jobs: BTreeSet<JobId>,
+    /// Contents that its jobs named: it has them, or will soon.
+    contents: BTreeSet<ContentHash>,
     /// It joined and has not stolen yet: it may take jobs of any application.
     pub(super) joining: bool,
     /// When it may try to steal again, and how often in a row it tried in vain.
@@ -157,6 +164,39 @@ pub(super) struct Node {
 }
 
 impl Node {
+    pub(super) fn new(hello: &NodeHello, now: Instant) -> Self {
+        Self {
+            name: hello.name.clone(),
+            session: hello.session,
+            contact: hello.contact.clone(),
+            devices: hello.devices.iter().cloned().map(|info| Device::new(info, now)).collect(),
+            link: None,
+            last_heard: now,
+            state: NodeState::Alive,
+            full_until: None,
+            recheck: None,
+            jobs: BTreeSet::new(),
+            contents: BTreeSet::new(),
+            joining: true,
+            steal_at: now,
+            vain_steals: 0,
+        }
+    }
+
+    /// Bytes of these contents that it has to fetch.
+    pub(super) fn missing_bytes(&self, contents: &[Content]) -> u64 {
+        let missing = contents.iter().filter(|content| !self.contents.contains(&content.hash));
+        missing.fold(0, |sum, content| sum.saturating_add(content.size_bytes))
+    }
+
+    /// It gets jobs that name these.
+    pub(super) fn will_hold(&mut self, contents: &[Content]) {
+        self.contents.extend(contents.iter().map(|content| content.hash));
+        while self.contents.len() > MAX_KNOWN_CONTENTS {
+            self.contents.pop_first();
+        }
+    }
+
     /// Whether new work may be planned here.
     pub(super) fn takes_work(&self) -> bool {
         match self.state {
@@ -182,81 +222,61 @@ pub(super) struct Recheck {
 pub(super) struct Device {
     pub(super) info: DeviceInfo,
     pub(super) lost: bool,
-    /// Loads of the jobs placed here and not executed.
-    pub(super) queued_ns: u128,
+    /// Of the jobs placed here and not executed.
+    pub(super) throughput: Throughput,
     pub(super) planned_jobs: u64,
-    pub(super) running_jobs: u32,
+    /// Since when it may have been at the job that it runs now.
+    busy_since: Instant,
+    /// By the last heartbeat.
+    pub(super) running: Option<RunningJob>,
     pub(super) executed_jobs: u64,
     pub(super) device_time_ns: u64,
-    /// Work per device time, by completed jobs.
-    pub(super) measured_rate: Option<f64>,
 }
 
 impl Device {
-    pub(super) const fn new(info: DeviceInfo) -> Self {
+    pub(super) const fn new(info: DeviceInfo, now: Instant) -> Self {
+        let throughput = Throughput::new(info.score);
         Self {
             info,
             lost: false,
-            queued_ns: 0,
+            throughput,
             planned_jobs: 0,
-            running_jobs: 0,
+            busy_since: now,
+            running: None,
             executed_jobs: 0,
             device_time_ns: 0,
-            measured_rate: None,
         }
     }
 
-    /// Work per time. This is the place where a rate per (module, device) will be looked up.
-    pub(super) fn rate(&self, calibration: &Calibration) -> f64 {
-        self.measured_rate.unwrap_or(self.info.score * calibration.rate_per_score)
+    /// When it will be done with what it has, in nanoseconds from now: what is queued, less what of the first job must be
+    /// done already.
+    pub(super) fn free_at_ns(&self, now: Instant, modules: &Modules) -> f64 {
+        if self.planned_jobs == 0 {
+            return 0.0;
+        }
+        let queued_ns = self.throughput.queued_ns(modules);
+        let elapsed_ns = now.since(self.busy_since).as_nanos() as f64;
+        queued_ns - elapsed_ns.min(queued_ns / self.planned_jobs as f64)
     }
 
-    pub(super) fn add_load(&mut self, load_ns: u64) {
-        self.queued_ns += u128::from(load_ns);
+    pub(super) fn add_load(&mut self, now: Instant, load: Load) {
+        if self.planned_jobs == 0 {
+            self.busy_since = now;
+        }
+        self.throughput.add(load);
         self.planned_jobs += 1;
     }
 
-    pub(super) fn drop_load(&mut self, load_ns: u64) {
-        self.queued_ns -= u128::from(load_ns);
+    pub(super) fn drop_load(&mut self, load: Load) {
+        self.throughput.remove(load);
         self.planned_jobs -= 1;
     }
 
-    /// Learns from one completed job.
-    pub(super) fn completed(&mut self, calibration: &mut Calibration, load_ns: u64, device_time_ns: u64) {
-        if load_ns == 0 || device_time_ns == 0 {
-            return;
-        }
-        let sample = load_ns as f64 / device_time_ns as f64;
-        calibration.observe(sample / self.info.score);
-        let rate = self.rate(calibration);
-        let sample = sample.clamp(rate / MAX_RATE_STEP, rate * MAX_RATE_STEP);
-        self.measured_rate = Some(rate + RATE_GAIN * (sample - rate));
-    }
-}
-
-/// What a point of score is worth: makes the scores of devices without a completed job comparable with the measured
-/// rates of the others.
-#[derive(Debug)]
-pub(super) struct Calibration {
-    rate_per_score: f64,
-    calibrated: bool,
-}
-
-impl Default for Calibration {
-    fn default() -> Self {
-        Self { rate_per_score: 1.0, calibrated: false }
-    }
-}
-
-impl Calibration {
-    fn observe(&mut self, sample: f64) {
-        if self.calibrated {
-            let so_far = self.rate_per_score;
-            let sample = sample.clamp(so_far / MAX_RATE_STEP, so_far * MAX_RATE_STEP);
-            self.rate_per_score = so_far + RATE_GAIN * (sample - so_far);
-        } else {
-            self.rate_per_score = sample;
-            self.calibrated = true;
-        }
+    /// Counts one completed job, and learns from it.
+    pub(super) fn completed(&mut self, now: Instant, modules: &mut Modules, load: Load, device_time_ns: u64) {
+        self.busy_since = now;
+        self.executed_jobs += 1;
+        self.device_time_ns = self.device_time_ns.saturating_add(device_time_ns);
+        self.throughput.completed(modules, load, device_time_ns);
     }
 }

@@ -1,5 +1,5 @@
-//! Where jobs go: first come, first served over plan requests, and list scheduling inside one: each job to the device
-//! with the earliest estimated finish (10-scheduling.md section 1).
+//! Where jobs go: first come, first served over plan requests; inside one as the application's policy says
+//! (10-scheduling.md section 1).
 //!
 //! It never moves a job that has a place; that is `replan`'s.
 
@@ -8,9 +8,10 @@ use std::collections::BTreeMap;
 use super::{
     CoordinatorMachine,
     model::{App, Batch, Job, JobState, Pending, Placement},
+    policy::{Choice, Fcfs, LongestFirst, PlacementPolicy, Policy, Question, QuestionDevice, QuestionJob},
+    rates::{Load, Module},
 };
 use crate::{
-    device::Requirements,
     id::{AppId, Attempt, BatchId, DeviceIndex, JobAttempt, JobKey, NodeId, TaskId},
     message::{CoordinatorToApp, CostNs, DevicePlan, NodePlan, Plan, PlanRequest, WaitReason},
     time::Instant,
@@ -28,10 +29,14 @@ const MAX_REPEATED_JOBS: usize = 4_096;
 
 /// What a job of unknown cost counts as when no job of its batch has a known one, in nanoseconds. Only its ratio to
 /// other jobs of unknown cost matters, and that is 1.
-const UNIT_LOAD_NS: u64 = 1_000_000;
+const UNIT_LOAD: f64 = 1e6;
 
 /// Costs count up to this, in nanoseconds (about 13 days): no hint can make a device's queue overflow.
-const MAX_LOAD_NS: u64 = 1 << 50;
+const MAX_LOAD: u64 = 1 << 50;
+
+/// What a byte that a node lacks takes to get there, in nanoseconds: gigabit Ethernet, 117 MB of payload a second. It
+/// decides between a node that has a scene and one that does not; a faster network makes both ready sooner.
+pub(super) const FETCH_NS_PER_BYTE: f64 = 1e9 / 117e6;
 
 impl CoordinatorMachine {
     pub(super) fn plan_requested(&mut self, id: AppId, request: PlanRequest) {
@@ -43,10 +48,16 @@ impl CoordinatorMachine {
             self.expel_app(id, reason);
             return;
         }
+        if let Some(batch) = app.batches.get(&request.batch).filter(|batch| batch.task != request.task) {
+            let reason = format!("{} is of {}, not of {}", request.batch, batch.task, request.task);
+            self.expel_app(id, reason);
+            return;
+        }
         // Asked again: whoever waits is told again.
         let mut keys = self.withdraw_pending(id, request.batch);
         let Some(app) = self.apps.get_mut(&id) else { return };
-        let intake = take_in(app, &request);
+        let module = self.modules.named(request.module);
+        let intake = take_in(app, &request, module);
         keys.extend(intake.fresh);
         if !keys.is_empty() {
             let batch = request.batch;
@@ -78,6 +89,7 @@ impl CoordinatorMachine {
     pub(super) fn forget_pending(&mut self, gone: impl Fn(&Pending) -> bool) {
         self.fresh.retain(|pending| !gone(pending));
         self.stuck.retain(|pending| !gone(pending));
+        self.questions.retain(|_, asked| !gone(&asked.pending));
     }
 
     /// Takes the jobs of a task out of line.
@@ -88,6 +100,7 @@ impl CoordinatorMachine {
             }
             queue.retain(|pending| !pending.keys.is_empty());
         }
+        self.questions.retain(|_, asked| (asked.pending.app, asked.task) != (id, task));
     }
 
     /// Says again where the application's jobs are.
@@ -117,116 +130,165 @@ impl CoordinatorMachine {
         let nodes: Vec<NodePlan> =
             grouped.into_iter().filter_map(|(node, devices)| self.node_plan(node, devices)).collect();
         if !nodes.is_empty() {
-            self.tell_app(id, CoordinatorToApp::Plan(Plan { batch: None, nodes }));
+            self.tell_app(id, CoordinatorToApp::Plan(Plan { batch: None, speculative: false, nodes }));
         }
     }
 
-    fn place_batch(&mut self, now: Instant, mut pending: Pending) {
+    fn place_batch(&mut self, now: Instant, pending: Pending) {
+        let Some((pending, mut question)) = self.question(now, pending) else { return };
         let Some(app) = self.apps.get(&pending.app) else { return };
-        let Some(batch) = app.batches.get(&pending.batch) else { return };
-        let wants = wanted(app, &pending);
-        if wants.is_empty() {
-            return;
+        let choices = match &app.policy {
+            Policy::Fcfs => Fcfs.place(&question),
+            Policy::History => {
+                self.history.recall(&app.name, &mut question.jobs);
+                LongestFirst.place(&question)
+            }
+            Policy::Plugin(name) if self.is_trusted(now, name) => {
+                let name = name.clone();
+                return self.ask(now, name, pending, question);
+            }
+            Policy::Plugin(_) => Fcfs.place(&question),
+        };
+        self.enter(now, &pending, &question, &choices);
+    }
+
+    /// Places a batch without asking its application's plug-in.
+    pub(super) fn place_first_come(&mut self, now: Instant, pending: Pending) {
+        if let Some((pending, question)) = self.question(now, pending) {
+            let choices = Fcfs.place(&question);
+            self.enter(now, &pending, &question, &choices);
+        }
+    }
+
+    /// What is to be decided for a batch. `None` if nothing is: its jobs are gone, or wait in `stuck` for a device.
+    fn question(&mut self, now: Instant, mut pending: Pending) -> Option<(Pending, Question)> {
+        let app = self.apps.get(&pending.app)?;
+        let batch = app.batches.get(&pending.batch)?;
+        let jobs = wanted(app, &pending);
+        if jobs.is_empty() {
+            return None;
         }
         // While its application is away a job could not be sent: it would only fill up a device's queue.
-        let candidates =
-            if app.link.is_some() { self.candidates(now, app, &batch.needs) } else { Candidates::default() };
-        if candidates.queues.is_empty() {
-            pending.keys = wants.into_iter().map(|want| want.key).collect();
+        let devices = if app.link.is_some() { self.candidates(now, app, batch) } else { Vec::new() };
+        if devices.is_empty() {
+            pending.keys =
+                jobs.into_iter().map(|job| JobKey { task: batch.task, index: job.index }).collect();
             self.say_waiting(pending.app, pending.batch);
             self.stuck.push_back(pending);
-            return;
+            return None;
         }
-        let shares = self.list_schedule(now, pending.app, &wants, candidates);
-        let nodes = self.enter_plan(shares);
-        if pending.answers.is_none() {
-            self.replanned_jobs += wants.len() as u64;
-        }
-        self.tell_app(pending.app, CoordinatorToApp::Plan(Plan { batch: pending.answers, nodes }));
+        let question = Question { app: pending.app, task: batch.task, jobs, devices };
+        Some((pending, question))
     }
 
-    /// Devices that may take jobs of these needs, by node and index.
-    fn candidates(&self, now: Instant, app: &App, needs: &Requirements) -> Candidates {
-        let mut candidates = Candidates::default();
+    /// Gives the jobs of a batch their places, and tells the application.
+    pub(super) fn enter(&mut self, now: Instant, pending: &Pending, question: &Question, choices: &[Choice]) {
+        let shares = self.issue_attempts(now, pending, question, choices);
+        let nodes = self.enter_plan(now, pending, shares);
+        if pending.answers.is_none() {
+            self.replanned_jobs += choices.len() as u64;
+        }
+        self.tell_app(
+            pending.app,
+            CoordinatorToApp::Plan(Plan { batch: pending.answers, speculative: false, nodes }),
+        );
+    }
+
+    /// Devices that may take jobs of a batch, by node and index.
+    fn candidates(&self, now: Instant, app: &App, batch: &Batch) -> Vec<QuestionDevice> {
+        let mut candidates = Vec::new();
         for (&id, node) in self.nodes.iter().filter(|(_, node)| node.takes_work()) {
             if app.unreachable.get(&id).is_some_and(|until| *until > now) {
                 continue;
             }
+            let ready_at_ns = node.missing_bytes(&batch.contents) as f64 * FETCH_NS_PER_BYTE;
             for (index, device) in (0_u16..).zip(&node.devices) {
-                if device.lost || !needs.fulfilled_by(&device.info) {
+                if device.lost || !batch.needs.fulfilled_by(&device.info) {
                     continue;
                 }
-                let time_per_load = 1.0 / device.rate(&self.calibration);
-                let free_at = device.queued_ns as f64 * time_per_load;
-                candidates.queues.push(Queue { node: id, free_at, time_per_load });
-                candidates.shares.push(Share {
+                candidates.push(QuestionDevice {
                     node: id,
                     device: DeviceIndex(index),
-                    jobs: Vec::new(),
-                    load_ns: 0,
+                    free_at_ns: device.free_at_ns(now, &self.modules),
+                    time_per_load: 1.0 / device.throughput.rate(&self.modules, batch.module),
+                    ready_at_ns,
                 });
             }
         }
         candidates
     }
 
-    /// Gives each job to the device with the earliest estimated finish.
-    fn list_schedule(
+    /// A fresh attempt for each job, grouped by device in the order of the choices.
+    fn issue_attempts(
         &mut self,
         now: Instant,
-        id: AppId,
-        wants: &[Want],
-        candidates: Candidates,
+        pending: &Pending,
+        question: &Question,
+        choices: &[Choice],
     ) -> Vec<Share> {
-        let Candidates { mut queues, mut shares } = candidates;
-        let Some(app) = self.apps.get_mut(&id) else { return shares };
-        for want in wants {
-            let Some(job) = app.jobs.get_mut(&want.key) else { continue };
-            let load = want.load_ns as f64;
-            let Some(index) = earliest_finish(&queues, load, want.avoid) else { continue };
-            let (queue, chosen) = (&mut queues[index], &mut shares[index]);
+        let share = |device: &QuestionDevice| Share {
+            node: device.node,
+            device: device.device,
+            jobs: Vec::new(),
+            loads: Vec::new(),
+        };
+        let mut shares: Vec<Share> = question.devices.iter().map(share).collect();
+        let Some(app) = self.apps.get_mut(&pending.app) else { return shares };
+        let Some(batch) = app.batches.get_mut(&pending.batch) else { return shares };
+        batch.told = None;
+        for choice in choices {
+            let wanted = &question.jobs[choice.job as usize];
+            let key = JobKey { task: question.task, index: wanted.index };
+            let Some(job) = app.jobs.get_mut(&key) else { continue };
+            let share = &mut shares[choice.device as usize];
             let attempt = Attempt { epoch: self.config.epoch, sequence: self.next_attempt };
             self.next_attempt += 1;
-            queue.free_at += load * queue.time_per_load;
-            chosen.load_ns += u128::from(want.load_ns);
-            chosen.jobs.push(JobAttempt { job: want.key.in_app(id), attempt });
+            #[expect(
+                clippy::cast_possible_truncation,
+                clippy::cast_sign_loss,
+                reason = "a float cast saturates"
+            )]
+            let load = Load { module: batch.module, amount: (wanted.load as u64).clamp(1, MAX_LOAD) };
+            share.jobs.push(JobAttempt { job: key.in_app(pending.app), attempt });
+            share.loads.push(load);
             job.state = JobState::Placed(Placement {
-                node: chosen.node,
-                device: chosen.device,
+                node: share.node,
+                device: share.device,
                 attempt,
                 planned_at: now,
-                load_ns: want.load_ns,
+                load,
                 retracting: None,
             });
             app.waiting_jobs -= 1;
-            if let Some(batch) = app.batches.get_mut(&job.batch) {
-                batch.told = None;
-            }
         }
         shares
     }
 
     /// Books the chosen places on their nodes, and groups them for the application.
-    fn enter_plan(&mut self, shares: Vec<Share>) -> Vec<NodePlan> {
+    fn enter_plan(&mut self, now: Instant, pending: &Pending, shares: Vec<Share>) -> Vec<NodePlan> {
         let mut plans: Vec<NodePlan> = Vec::new();
+        let batch = self.apps.get(&pending.app).and_then(|app| app.batches.get(&pending.batch));
+        let contents = batch.map_or(&[][..], |batch| &batch.contents);
         for share in shares.into_iter().filter(|share| !share.jobs.is_empty()) {
             let Some(node) = self.nodes.get_mut(&share.node) else { continue };
             node.jobs.extend(share.jobs.iter().map(|job| job.job));
             node.joining = false;
             if let Some(device) = node.device_mut(share.device) {
-                device.queued_ns += share.load_ns;
-                device.planned_jobs += share.jobs.len() as u64;
+                share.loads.iter().for_each(|&load| device.add_load(now, load));
             }
             let id = share.node;
             let share = DevicePlan { device: share.device, jobs: share.jobs };
             match plans.last_mut() {
                 Some(plan) if plan.node == id => plan.devices.push(share),
-                Some(_) | None => plans.push(NodePlan {
-                    node: id,
-                    session: node.session,
-                    contact: node.contact.clone(),
-                    devices: vec![share],
-                }),
+                Some(_) | None => {
+                    node.will_hold(contents);
+                    plans.push(NodePlan {
+                        node: id,
+                        session: node.session,
+                        contact: node.contact.clone(),
+                        devices: vec![share],
+                    });
+                }
             }
         }
         plans
@@ -262,6 +324,13 @@ impl CoordinatorMachine {
                 !asked
             });
         }
+        self.questions.retain(|_, asked| {
+            let again = asked.pending.app == id && asked.pending.batch == batch;
+            if again {
+                keys.append(&mut asked.pending.keys);
+            }
+            !again
+        });
         let Some(app) = self.apps.get_mut(&id) else { return Vec::new() };
         if let Some(waiting) = app.batches.get_mut(&batch) {
             waiting.told = None;
@@ -271,34 +340,12 @@ impl CoordinatorMachine {
     }
 }
 
-/// A job to be placed.
-struct Want {
-    key: JobKey,
-    load_ns: u64,
-    avoid: Option<NodeId>,
-}
-
-/// Devices that may take jobs: `queues[i]` and `shares[i]` are one device's. Apart, because every job reads all the
-/// queues and writes one share.
-#[derive(Default)]
-struct Candidates {
-    queues: Vec<Queue>,
-    shares: Vec<Share>,
-}
-
-/// How busy a device is. Times are in nanoseconds from now.
-struct Queue {
-    node: NodeId,
-    free_at: f64,
-    time_per_load: f64,
-}
-
-/// What a device got so far.
+/// What a device got.
 struct Share {
     node: NodeId,
     device: DeviceIndex,
     jobs: Vec<JobAttempt>,
-    load_ns: u128,
+    loads: Vec<Load>,
 }
 
 /// What a plan request consists of, seen from what is known.
@@ -309,7 +356,7 @@ struct Intake {
 }
 
 /// Enters the jobs of a request that are new; a repeated request (after a reconnect) changes nothing.
-fn take_in(app: &mut App, request: &PlanRequest) -> Intake {
+fn take_in(app: &mut App, request: &PlanRequest, module: Module) -> Intake {
     let mut intake = Intake::default();
     for planned in &request.jobs {
         let key = JobKey { task: request.task, index: planned.index };
@@ -337,52 +384,37 @@ fn take_in(app: &mut App, request: &PlanRequest) -> Intake {
     }
     if let Ok(added @ 1..) = u32::try_from(intake.fresh.len()) {
         app.waiting_jobs += u64::from(added);
-        let new = || Batch { needs: request.needs, open_jobs: 0, told: None };
+        let new = || Batch {
+            task: request.task,
+            needs: request.needs,
+            module,
+            contents: request.contents.clone(),
+            open_jobs: 0,
+            told: None,
+        };
         app.batches.entry(request.batch).or_insert_with(new).open_jobs += added;
     }
     intake
 }
 
-/// The jobs of a batch in line that still wait, with their loads: a job of unknown cost counts as much as the mean of the known ones.
-fn wanted(app: &App, pending: &Pending) -> Vec<Want> {
-    let mut wants = Vec::with_capacity(pending.keys.len());
-    let mut known = 0_u64;
-    let mut known_ns = 0_u128;
+/// The jobs of a batch in line that still wait, with their loads: a job of unknown cost counts as much as the mean of
+/// the known ones.
+fn wanted(app: &App, pending: &Pending) -> Vec<QuestionJob> {
+    let mut jobs = Vec::with_capacity(pending.keys.len());
+    let mut known = 0_u32;
+    let mut sum = 0.0;
     for &key in &pending.keys {
         let Some(job) = app.waiting_job(key, pending.batch) else { continue };
-        let load_ns = job.cost.0.min(MAX_LOAD_NS);
+        let load = job.cost.0.min(MAX_LOAD) as f64;
         if job.cost != CostNs(0) {
             known += 1;
-            known_ns += u128::from(load_ns);
+            sum += load;
         }
-        wants.push(Want { key, load_ns, avoid: job.avoid });
+        jobs.push(QuestionJob { index: key.index, load, avoid: job.avoid });
     }
-    let mean_ns = known_ns.checked_div(u128::from(known)).and_then(|mean| u64::try_from(mean).ok());
-    let unknown_ns = mean_ns.unwrap_or(UNIT_LOAD_NS);
-    for want in wants.iter_mut().filter(|want| want.load_ns == 0) {
-        want.load_ns = unknown_ns;
+    let unknown = if known > 0 { sum / f64::from(known) } else { UNIT_LOAD };
+    for job in jobs.iter_mut().filter(|job| job.load == 0.0) {
+        job.load = unknown;
     }
-    wants
-}
-
-/// The device that would finish a job first; one on another node than `avoid` wherever there is one.
-///
-/// A scan, not a heap: with unequal loads and rates the order of finishes differs from job to job. The scan reads two
-/// numbers per device; see `farm-core/tests/placement_cost.rs` for what it costs at 1,000 devices.
-fn earliest_finish(queues: &[Queue], load: f64, avoid: Option<NodeId>) -> Option<usize> {
-    let elsewhere = earliest(queues.iter().enumerate().filter(|(_, queue)| avoid != Some(queue.node)), load);
-    elsewhere.or_else(|| earliest(queues.iter().enumerate(), load))
-}
-
-fn earliest<'queue>(queues: impl Iterator<Item = (usize, &'queue Queue)>, load: f64) -> Option<usize> {
-    let mut best = None;
-    let mut best_finish = f64::INFINITY;
-    for (index, queue) in queues {
-        let finish = queue.free_at + load * queue.time_per_load;
-        if best.is_none() || finish < best_finish {
-            best = Some(index);
-            best_finish = finish;
-        }
-    }
-    best
+    jobs
 }

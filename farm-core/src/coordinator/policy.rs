@@ -5,6 +5,8 @@
 //! are built in; a third kind, the plug-in, is a shared object that the coordinator's driver asks in a process of its
 //! own, and its answer comes as an event.
 
+use std::collections::BTreeMap;
+
 use serde::{Deserialize, Serialize};
 
 use crate::id::{AppId, DeviceIndex, JobIndex, NodeId, TaskId};
@@ -37,8 +39,10 @@ pub struct Question {
 pub struct QuestionJob {
     /// Its index in the task.
     pub index: JobIndex,
-    /// Estimated work; nanoseconds on a device of speed 1.0 if the application said so, else in a unit of the batch's own.
-    pub load_ns: u64,
+    /// Estimated work: nanoseconds on a device of speed 1.0 if the application said so, else in a unit of the batch's own.
+    pub load: f64,
+    /// The node that lost it last: another one is preferred.
+    pub avoid: Option<NodeId>,
 }
 
 /// A device of a [`Question`].
@@ -52,8 +56,8 @@ pub struct QuestionDevice {
     pub free_at_ns: f64,
     /// Nanoseconds that a unit of load takes there.
     pub time_per_load: f64,
-    /// Time to bring what it lacks of the batch's contents, in nanoseconds; zero if it has all of them.
-    pub fetch_ns: f64,
+    /// When what the batch needs can be there, in nanoseconds from now; zero where it is there.
+    pub ready_at_ns: f64,
 }
 
 /// A job's place, by positions in the [`Question`]'s lists.
@@ -63,4 +67,163 @@ pub struct Choice {
     pub job: u32,
     /// Which of the devices.
     pub device: u32,
+}
+
+/// What an application chose.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(super) enum Policy {
+    Fcfs,
+    History,
+    /// By its name in the coordinator's folder.
+    Plugin(String),
+}
+
+impl Policy {
+    pub(super) fn named(name: &str) -> Self {
+        match name {
+            "" | FCFS => Self::Fcfs,
+            HISTORY => Self::History,
+            name => Self::Plugin(name.to_owned()),
+        }
+    }
+}
+
+/// A policy that answers at once.
+pub(super) trait PlacementPolicy {
+    /// A choice for every job, in the order they should run.
+    fn place(&self, question: &Question) -> Vec<Choice>;
+}
+
+/// First come, first served, by list scheduling: each job in its turn to the device that would finish it first.
+///
+/// A scan, not a heap: with unequal loads and rates the order of finishes differs from job to job. The scan reads few
+/// numbers per device; see `farm-core/tests/placement_cost.rs` for what it costs at 1,000 devices.
+#[derive(Debug)]
+pub(super) struct Fcfs;
+
+impl PlacementPolicy for Fcfs {
+    fn place(&self, question: &Question) -> Vec<Choice> {
+        let mut queues = Queues::of(&question.devices);
+        (0_u32..)
+            .zip(&question.jobs)
+            .map(|(job, wanted)| Choice { job, device: queues.take(wanted) })
+            .collect()
+    }
+}
+
+/// Longest first: what a batch of known costs gains most from.
+#[derive(Debug)]
+pub(super) struct LongestFirst;
+
+impl PlacementPolicy for LongestFirst {
+    fn place(&self, question: &Question) -> Vec<Choice> {
+        let mut jobs: Vec<(u32, &QuestionJob)> = (0_u32..).zip(&question.jobs).collect();
+        // Stable: equal ones stay first come, first served.
+        jobs.sort_by(|(_, one), (_, other)| other.load.total_cmp(&one.load));
+        let mut queues = Queues::of(&question.devices);
+        jobs.into_iter().map(|(job, wanted)| Choice { job, device: queues.take(wanted) }).collect()
+    }
+}
+
+/// How busy the devices of a question are, as its jobs are spread over them.
+struct Queues(Vec<Queue>);
+
+/// Times are in nanoseconds from now.
+struct Queue {
+    node: NodeId,
+    free_at: f64,
+    ready_at: f64,
+    time_per_load: f64,
+}
+
+impl Queues {
+    fn of(devices: &[QuestionDevice]) -> Self {
+        let queue = |device: &QuestionDevice| Queue {
+            node: device.node,
+            free_at: device.free_at_ns,
+            ready_at: device.ready_at_ns,
+            time_per_load: device.time_per_load,
+        };
+        Self(devices.iter().map(queue).collect())
+    }
+
+    /// Gives a job to the device that would finish it first; to one of another node than the one to avoid wherever there
+    /// is one.
+    fn take(&mut self, job: &QuestionJob) -> u32 {
+        let everywhere = || (0_u32..).zip(&self.0);
+        let elsewhere = everywhere().filter(|(_, queue)| job.avoid != Some(queue.node));
+        let chosen = earliest(elsewhere, job.load).or_else(|| earliest(everywhere(), job.load));
+        let (device, finish) = chosen.expect("a question has at least one device");
+        if let Some(queue) = self.0.get_mut(device as usize) {
+            queue.free_at = finish;
+        }
+        device
+    }
+}
+
+/// The device with the earliest finish, and the finish.
+fn earliest<'queue>(queues: impl Iterator<Item = (u32, &'queue Queue)>, load: f64) -> Option<(u32, f64)> {
+    let mut best = None;
+    for (index, queue) in queues {
+        let finish = queue.free_at.max(queue.ready_at) + load * queue.time_per_load;
+        if best.is_none_or(|(_, earliest)| finish < earliest) {
+            best = Some((index, finish));
+        }
+    }
+    best
+}
+
+/// Most applications whose last task is remembered, by name; beyond it the one that computed longest ago is forgotten.
+const MAX_HISTORIES: usize = 64;
+
+/// Most jobs of a task that are remembered (256 KiB); those of larger indices are as good as unknown.
+const MAX_HISTORY_JOBS: usize = 65_536;
+
+/// What the jobs of applications took the last time, by the application's name and the job's index.
+#[derive(Debug, Default)]
+pub(super) struct History {
+    by_name: BTreeMap<String, Past>,
+    notes: u64,
+}
+
+#[derive(Debug, Default)]
+struct Past {
+    work: Vec<f32>,
+    last_note: u64,
+}
+
+impl History {
+    #[expect(clippy::cast_possible_truncation, reason = "seven digits are more than a hint needs")]
+    pub(super) fn note(&mut self, app: &str, index: JobIndex, work: f64) {
+        let Some(index) = usize::try_from(index.0).ok().filter(|index| *index < MAX_HISTORY_JOBS) else {
+            return;
+        };
+        self.notes += 1;
+        if !self.by_name.contains_key(app) {
+            if self.by_name.len() >= MAX_HISTORIES
+                && let Some(oldest) =
+                    self.by_name.iter().min_by_key(|(_, past)| past.last_note).map(|(name, _)| name.clone())
+            {
+                self.by_name.remove(&oldest);
+            }
+            self.by_name.insert(app.to_owned(), Past::default());
+        }
+        let Some(past) = self.by_name.get_mut(app) else { return };
+        past.last_note = self.notes;
+        if past.work.len() <= index {
+            past.work.resize(index + 1, 0.0);
+        }
+        past.work[index] = work as f32;
+    }
+
+    /// Puts what is known in the place of what was estimated (temporal coherence: thesis 5.6.3, of fly-throughs).
+    pub(super) fn recall(&self, app: &str, jobs: &mut [QuestionJob]) {
+        let Some(past) = self.by_name.get(app) else { return };
+        for job in jobs {
+            let known = usize::try_from(job.index.0).ok().and_then(|index| past.work.get(index));
+            if let Some(&work) = known.filter(|work| **work > 0.0) {
+                job.load = work.into();
+            }
+        }
+    }
 }

@@ -1,13 +1,11 @@
 //! Who is there: hellos, goodbyes, closed connections, draining. Ids are issued here, once each.
 
-use std::{
-    collections::{BTreeMap, BTreeSet},
-    time::Duration,
-};
+use std::{collections::BTreeMap, time::Duration};
 
 use super::{
     CoordinatorMachine, Effect, NodeState,
-    model::{App, Device, Node, Peer},
+    model::{App, Node, Peer},
+    policy::{FCFS, HISTORY, Policy},
     replan::Blame,
 };
 use crate::{
@@ -65,7 +63,9 @@ impl CoordinatorMachine {
                 }
             }
             Some(false) => self.fence(now, id, &hello),
-            None => self.add_node(now, id, &hello),
+            None => {
+                self.nodes.insert(id, Node::new(&hello, now));
+            }
         }
         let Some(node) = self.nodes.get_mut(&id) else { return };
         node.link = Some(link);
@@ -121,6 +121,7 @@ impl CoordinatorMachine {
 
     /// The application is gone: everything of it is freed, here and on the nodes.
     pub(super) fn app_leaves(&mut self, id: AppId) {
+        self.drop_backups_of(id);
         let Some(app) = self.apps.remove(&id) else { return };
         for (key, job) in app.jobs {
             self.release(id, key, job.state);
@@ -148,6 +149,17 @@ impl CoordinatorMachine {
     fn admit_app(&self, hello: &AppHello) -> Result<Admission, String> {
         check_protocol(hello.protocol)?;
         check_name(&hello.name)?;
+        let policy = Policy::named(&hello.policy);
+        if let Policy::Plugin(name) = &policy
+            && !self.config.plugins.contains(name)
+        {
+            let known: Vec<&str> =
+                [FCFS, HISTORY].into_iter().chain(self.config.plugins.iter().map(String::as_str)).collect();
+            return Err(format!(
+                "placement policy `{name}` is not known here; there are {}",
+                known.join(", ")
+            ));
+        }
         if !(hello.weight.is_finite() && hello.weight > 0.0) {
             return Err(format!("weight {} must be positive and finite", hello.weight));
         }
@@ -208,6 +220,7 @@ impl CoordinatorMachine {
             name: hello.name,
             weight: hello.weight,
             global_stealing: hello.global_stealing,
+            policy: Policy::named(&hello.policy),
             incarnation,
             link: Some(link),
             heard: false,
@@ -257,25 +270,6 @@ impl CoordinatorMachine {
         self.arm(now.after(Duration::from_millis(self.config.liveness.dead_ms)));
     }
 
-    fn add_node(&mut self, now: Instant, id: NodeId, hello: &NodeHello) {
-        let node = Node {
-            name: hello.name.clone(),
-            session: hello.session,
-            contact: hello.contact.clone(),
-            devices: hello.devices.iter().cloned().map(Device::new).collect(),
-            link: None,
-            last_heard: now,
-            state: NodeState::Alive,
-            full_until: None,
-            recheck: None,
-            jobs: BTreeSet::new(),
-            joining: true,
-            steal_at: now,
-            vain_steals: 0,
-        };
-        self.nodes.insert(id, node);
-    }
-
     /// A second life of a node's name: the first is over at once. Jobs that the new one brought along stay with it.
     fn fence(&mut self, now: Instant, id: NodeId, hello: &NodeHello) {
         if let Some(link) = self.nodes.get(&id).and_then(|node| node.link) {
@@ -286,8 +280,8 @@ impl CoordinatorMachine {
         self.end_steals_from(id);
         let kept = self.inherited(id, hello);
         self.remove_node(now, id, Blame::OldestOnEachDevice);
-        self.add_node(now, id, hello);
-        self.inherit(id, &kept);
+        self.nodes.insert(id, Node::new(hello, now));
+        self.inherit(now, id, &kept);
     }
 
     fn node_id(&mut self, name: &str) -> NodeId {

@@ -37,6 +37,7 @@ impl CoordinatorMachine {
     /// Removes a node; its undelivered jobs get into line for new attempts.
     pub(super) fn remove_node(&mut self, now: Instant, id: NodeId, blame: Blame) {
         self.end_steals_from(id);
+        self.drop_backups(|_, backup| backup.node == id);
         let Some(node) = self.nodes.remove(&id) else { return };
         if let Some(link) = node.link {
             self.close(link);
@@ -85,7 +86,7 @@ impl CoordinatorMachine {
                 None => {
                     left.insert(item.job.app);
                 }
-                Some(_) if self.holder(item.job) != Some((id, item.attempt)) => stale.push(*item),
+                Some(_) if !self.answers_for(id, *item) => stale.push(*item),
                 Some(_) => {}
             }
         }
@@ -134,7 +135,7 @@ impl CoordinatorMachine {
     }
 
     /// Books inherited jobs on the new life of their node, and tells their applications.
-    pub(super) fn inherit(&mut self, id: NodeId, kept: &[JobId]) {
+    pub(super) fn inherit(&mut self, now: Instant, id: NodeId, kept: &[JobId]) {
         let mut by_app: BTreeMap<AppId, Vec<JobKey>> = BTreeMap::new();
         for &job in kept {
             let state = self.job(job).map(|job| job.state);
@@ -143,7 +144,7 @@ impl CoordinatorMachine {
             if let Some(JobState::Placed(place)) = state
                 && let Some(device) = node.device_mut(place.device)
             {
-                device.add_load(place.load_ns);
+                device.add_load(now, place.load);
                 by_app.entry(job.app).or_default().push(JobKey::of(job));
             }
         }
@@ -154,7 +155,11 @@ impl CoordinatorMachine {
 
     /// An application cannot reach a node: its jobs move off it.
     pub(super) fn unreachable(&mut self, now: Instant, app: AppId, id: NodeId, session: NodeSession) {
-        let Some(node) = self.nodes.get(&id).filter(|node| node.session == session) else { return };
+        if self.nodes.get(&id).is_none_or(|node| node.session != session) {
+            return;
+        }
+        self.drop_backups(|job, backup| (job.app, backup.node) == (app, id));
+        let Some(node) = self.nodes.get(&id) else { return };
         let jobs: Vec<JobId> = node.jobs.range(JobId::range_of(app)).copied().collect();
         let until = now.after(Duration::from_millis(UNREACHABLE_MS));
         if let Some(app) = self.apps.get_mut(&app) {
@@ -178,6 +183,7 @@ impl CoordinatorMachine {
             app.jobs.range(JobKey::range_of(task)).map(|(key, _)| key.in_app(id)).collect();
         let mut on_nodes: BTreeMap<NodeId, Vec<JobAttempt>> = BTreeMap::new();
         for job in jobs {
+            self.drop_backup(job);
             if let Some((node, attempt)) = self.holder(job) {
                 on_nodes.entry(node).or_default().push(JobAttempt { job, attempt });
             }
@@ -205,8 +211,13 @@ impl CoordinatorMachine {
         }
     }
 
-    /// Takes a job off its place and puts it into line for a new attempt.
+    /// Takes a job off its place and puts it into line for a new attempt; one that runs elsewhere too just goes on
+    /// there.
     pub(super) fn requeue(&mut self, id: JobId, avoid: Option<NodeId>) {
+        if self.promote_backup(id).is_some() {
+            self.repeat_plan(id.app, &[JobKey::of(id)]);
+            return;
+        }
         let Some(app) = self.apps.get_mut(&id.app) else { return };
         let key = JobKey::of(id);
         let Some(job) = app.jobs.get_mut(&key) else { return };
@@ -229,12 +240,13 @@ impl CoordinatorMachine {
         if let JobState::Placed(place) = state
             && let Some(device) = node.device_mut(place.device)
         {
-            device.drop_load(place.load_ns);
+            device.drop_load(place.load);
         }
     }
 
     /// A job is over, or nobody wants it any more.
     pub(super) fn forget_job(&mut self, id: JobId) -> Option<Job> {
+        self.drop_backup(id);
         let app = self.apps.get_mut(&id.app)?;
         let key = JobKey::of(id);
         let job = app.jobs.remove(&key)?;

@@ -2,10 +2,10 @@
 
 use std::time::Duration;
 
-use super::{CoordinatorMachine, model::JobState};
+use super::{CoordinatorMachine, model::JobState, policy::Policy, rates::Load};
 use crate::{
-    id::{DeviceIndex, JobAttempt, NodeId},
-    message::{DeviceLoad, Executed, JobFailure},
+    id::{DeviceIndex, JobAttempt, JobId, NodeId},
+    message::{CoordinatorToNode, DeviceLoad, Executed, JobFailure},
     time::Instant,
 };
 
@@ -31,7 +31,7 @@ impl CoordinatorMachine {
     pub(super) fn loads_reported(&mut self, id: NodeId, loads: &[DeviceLoad]) {
         let Some(node) = self.nodes.get_mut(&id) else { return };
         for (device, load) in node.devices.iter_mut().zip(loads) {
-            device.running_jobs = load.running.is_some().into();
+            device.running = load.running;
         }
     }
 
@@ -40,21 +40,30 @@ impl CoordinatorMachine {
         let Some(node) = self.nodes.get_mut(&id) else { return };
         if let Some(device) = node.device_mut(device) {
             device.lost = true;
-            device.running_jobs = 0;
+            device.running = None;
         }
     }
 
     fn executed(&mut self, now: Instant, node: NodeId, ended: Executed) {
         let Executed { job: JobAttempt { job: id, attempt }, device, device_time_ns, trace: _, failure } =
             ended;
+        let job = JobAttempt { job: id, attempt };
+        if self.is_backup(job, node) {
+            if failure.as_ref().is_some_and(JobFailure::can_be_retried) {
+                self.drop_backup(id);
+                return;
+            }
+            self.first_one_loses(id);
+        }
         // Reports of attempts that were replaced meanwhile change nothing.
         if self.holder(id) != Some((node, attempt)) {
             return;
         }
         match failure {
             None => {
-                if let Some(load_ns) = self.device_freed(node, JobAttempt { job: id, attempt }) {
-                    self.account(node, device, JobAttempt { job: id, attempt }, load_ns, device_time_ns);
+                self.drop_backup(id);
+                if let Some(load) = self.device_freed(node, JobAttempt { job: id, attempt }) {
+                    self.account(now, node, device, id, load, device_time_ns);
                 }
             }
             Some(JobFailure::Returned) => {
@@ -66,8 +75,18 @@ impl CoordinatorMachine {
             Some(failure) if failure.can_be_retried() => self.crashed(id, failure, node),
             // Its application gets this failure from the node, as a result; nothing else is owed.
             Some(_) => {
+                self.drop_backup(id);
                 self.device_freed(node, JobAttempt { job: id, attempt });
             }
+        }
+    }
+
+    /// The second attempt ended first.
+    fn first_one_loses(&mut self, id: JobId) {
+        let loser = self.holder(id);
+        self.promote_backup(id);
+        if let Some((node, attempt)) = loser {
+            self.tell_node(node, CoordinatorToNode::Cancel { jobs: vec![JobAttempt { job: id, attempt }] });
         }
     }
 
@@ -83,31 +102,32 @@ impl CoordinatorMachine {
     }
 
     /// The job left its device. Returns its load the first time it is told.
-    fn device_freed(&mut self, id: NodeId, job: JobAttempt) -> Option<u64> {
+    fn device_freed(&mut self, id: NodeId, job: JobAttempt) -> Option<Load> {
         let record = self.job_mut(job.job)?;
         let JobState::Placed(place) = record.state else { return None };
         record.state = JobState::Executed { node: id, device: place.device, attempt: job.attempt };
         let device = self.nodes.get_mut(&id)?.device_mut(place.device)?;
-        device.drop_load(place.load_ns);
-        Some(place.load_ns)
+        device.drop_load(place.load);
+        Some(place.load)
     }
 
     /// Charges a completed job, and learns from it, on the device that ran it (a local steal may have moved it).
     fn account(
         &mut self,
+        now: Instant,
         id: NodeId,
         device: DeviceIndex,
-        job: JobAttempt,
-        load_ns: u64,
+        job: JobId,
+        load: Load,
         device_time_ns: u64,
     ) {
-        if let Some(device) = self.nodes.get_mut(&id).and_then(|node| node.device_mut(device)) {
-            device.executed_jobs += 1;
-            device.device_time_ns = device.device_time_ns.saturating_add(device_time_ns);
-            device.completed(&mut self.calibration, load_ns, device_time_ns);
-        }
-        if let Some(app) = self.apps.get_mut(&job.job.app) {
-            app.device_time_ns = app.device_time_ns.saturating_add(device_time_ns);
+        let Some(device) = self.nodes.get_mut(&id).and_then(|node| node.device_mut(device)) else { return };
+        device.completed(now, &mut self.modules, load, device_time_ns);
+        let work = device.throughput.rate(&self.modules, load.module) * device_time_ns as f64;
+        let Some(app) = self.apps.get_mut(&job.app) else { return };
+        app.device_time_ns = app.device_time_ns.saturating_add(device_time_ns);
+        if app.policy == Policy::History {
+            self.history.note(&app.name, job.index, work);
         }
     }
 

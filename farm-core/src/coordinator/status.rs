@@ -13,6 +13,9 @@ impl CoordinatorMachine {
             apps: self.app_statuses(),
             delivered_jobs: self.delivered_jobs,
             replanned_jobs: self.replanned_jobs,
+            stolen_jobs: self.stolen_jobs,
+            speculations: self.speculations,
+            policy_fallbacks: self.policy_fallbacks,
         }
     }
 
@@ -44,7 +47,7 @@ impl CoordinatorMachine {
                     kind: device.info.kind,
                     score: device.info.score,
                     planned_jobs: device.planned_jobs,
-                    running_jobs: device.running_jobs,
+                    running_jobs: device.running.is_some().into(),
                     executed_jobs: device.executed_jobs,
                     device_time_ns: device.device_time_ns,
                 })

@@ -13,7 +13,9 @@ use std::{
 
 use super::{
     CoordinatorMachine, NodeState,
-    model::{App, Calibration, Device, Job, JobState, Node, Placement},
+    model::{App, Device, Job, JobState, Node, Placement},
+    placement::FETCH_NS_PER_BYTE,
+    rates::{Module, Modules},
 };
 use crate::{
     device::DeviceKind,
@@ -22,10 +24,38 @@ use crate::{
     time::Instant,
 };
 
-/// What a steal takes from the decision until its first job may start on the thief, in nanoseconds (10 ms). Four
-/// messages (retract, answer, plan, ticket) of at most 1 ms each on a LAN, 5 ms that the victim's reports may be old,
-/// 1 ms for staging.
-pub(super) const STEAL_LATENCY_NS: f64 = 10e6;
+/// What a steal takes besides messages, in nanoseconds (6 ms): 5 ms that the victim's reports may be old, 1 ms for
+/// staging.
+const STEAL_OVERHEAD_NS: f64 = 6e6;
+
+/// What an answer is taken to need before the first one came, in nanoseconds (2 ms): two messages on a LAN.
+const FIRST_ANSWER_NS: f64 = 2e6;
+
+/// Weight of a new answer in the mean time of answers.
+const ANSWER_GAIN: f64 = 0.2;
+
+/// What a steal takes from the decision until its first job may start on the thief. Four messages of like ways (retract,
+/// answer, plan, ticket), of which the first two are measured, and the rest.
+#[derive(Debug)]
+pub(super) struct StealLatency {
+    answer_ns: f64,
+}
+
+impl Default for StealLatency {
+    fn default() -> Self {
+        Self { answer_ns: FIRST_ANSWER_NS }
+    }
+}
+
+impl StealLatency {
+    pub(super) fn ns(&self) -> f64 {
+        2.0 * self.answer_ns + STEAL_OVERHEAD_NS
+    }
+
+    fn answered(&mut self, after: Duration) {
+        self.answer_ns += ANSWER_GAIN * (after.as_nanos() as f64 - self.answer_ns);
+    }
+}
 
 /// The least gain worth a steal, as a part of the job's finish on the victim: below it the estimates' errors decide.
 const LEAST_GAIN: f64 = 0.2;
@@ -46,7 +76,11 @@ const MAX_VICTIMS: usize = 4;
 /// How long an answer may take before the thief may try elsewhere, in milliseconds. A later answer still counts.
 const ANSWER_MS: u64 = 1_000;
 
-/// Pause after the first try in vain, in milliseconds; it doubles with each further one.
+/// Pause after a look at the farm that found nothing to steal. A look costs some 100 ns for each node (and device), so the
+/// pause grows by 1 us with the square of the nodes: with every node looking it is a tenth of a core at most.
+const LOOKING_PAUSE: Duration = Duration::from_millis(2);
+
+/// Pause after the first refusal of a victim, in milliseconds; it doubles with each further one.
 const PAUSE_MS: u64 = 10;
 
 /// The pause doubles at most this often: 640 ms.
@@ -61,49 +95,74 @@ pub(super) struct Steal {
     pub(super) victim: NodeId,
     /// As they were when the order left; some may have ended since.
     pub(super) jobs: BTreeMap<JobId, Attempt>,
-    load_ns: u128,
+    /// Time that they take the victim, in nanoseconds.
+    leaving_ns: f64,
+    ordered_at: Instant,
     pub(super) answer_by: Instant,
 }
 
 /// The devices of one kind on one node.
-#[derive(Clone, Copy, Debug)]
-struct Pool {
+#[derive(Debug)]
+struct Pool<'farm> {
     node: NodeId,
     kind: DeviceKind,
-    devices: usize,
+    devices: Vec<&'farm Device>,
+    modules: &'farm Modules,
     jobs: u64,
-    queued_ns: f64,
-    rate: f64,
-    fastest: f64,
+    /// How long its work takes, in nanoseconds.
+    remaining_ns: f64,
 }
 
-impl Pool {
-    fn of(id: NodeId, node: &Node, kind: DeviceKind, calibration: &Calibration) -> Option<Self> {
-        let empty = Self { node: id, kind, devices: 0, jobs: 0, queued_ns: 0.0, rate: 0.0, fastest: 0.0 };
-        let of_kind = node.devices.iter().filter(|device| !device.lost && device.info.kind == kind);
-        let pool = of_kind.fold(empty, |pool, device| {
-            let rate = device.rate(calibration);
-            Self {
-                devices: pool.devices + 1,
-                jobs: pool.jobs + device.planned_jobs,
-                queued_ns: pool.queued_ns + device.queued_ns as f64,
-                rate: pool.rate + rate,
-                fastest: pool.fastest.max(rate),
-                ..pool
+impl<'farm> Pool<'farm> {
+    fn of(
+        now: Instant,
+        id: NodeId,
+        node: &'farm Node,
+        kind: DeviceKind,
+        modules: &'farm Modules,
+    ) -> Option<Self> {
+        let of_kind = |device: &&Device| !device.lost && device.info.kind == kind;
+        let devices: Vec<&Device> = node.devices.iter().filter(of_kind).collect();
+        let jobs = devices.iter().map(|device| device.planned_jobs).sum();
+        let mut pool = Self { node: id, kind, devices, modules, jobs, remaining_ns: 0.0 };
+        // What each device has left, in the time that all of them together take for it.
+        let mut queued: BTreeMap<Module, f64> = BTreeMap::new();
+        for device in &pool.devices {
+            let queued_ns = device.throughput.queued_ns(modules);
+            let left = if queued_ns > 0.0 { device.free_at_ns(now, modules) / queued_ns } else { 0.0 };
+            for (module, amount) in device.throughput.queued() {
+                *queued.entry(module).or_default() += amount as f64 * left;
             }
-        });
-        (pool.devices > 0).then_some(pool)
+        }
+        pool.remaining_ns = queued.into_iter().map(|(module, amount)| amount / pool.rate(module)).sum();
+        (!pool.devices.is_empty()).then_some(pool)
     }
 
-    /// How long its work takes, in nanoseconds.
-    fn remaining_ns(&self) -> f64 {
-        self.queued_ns / self.rate
+    /// Load per nanosecond of all its devices.
+    fn rate(&self, module: Module) -> f64 {
+        self.devices.iter().map(|device| device.throughput.rate(self.modules, module)).sum()
+    }
+
+    /// When each of its devices is done with what it has.
+    fn free_at_ns(&self, now: Instant) -> Vec<f64> {
+        self.devices.iter().map(|device| device.free_at_ns(now, self.modules)).collect()
+    }
+
+    /// The last job ends later than [`Self::remaining_ns`], since devices do not end together: by half a job of one device
+    /// on average, less what that job adds itself. In the time that all of them together take for a job.
+    fn unevenness(&self) -> f64 {
+        (self.devices.len() as f64 - 1.0) / 2.0
+    }
+
+    /// Whether some of its jobs must be off the devices still.
+    fn has_waiting(&self) -> bool {
+        self.jobs > self.devices.len() as u64
     }
 
     /// Whether what is not on a device yet lasts no longer than a steal.
-    fn is_low(&self) -> bool {
-        let waiting = 1.0 - self.devices as f64 / self.jobs.max(1) as f64;
-        self.remaining_ns() * waiting <= STEAL_LATENCY_NS
+    fn is_low(&self, latency_ns: f64) -> bool {
+        let waiting = 1.0 - self.devices.len() as f64 / self.jobs.max(1) as f64;
+        self.remaining_ns * waiting <= latency_ns
     }
 }
 
@@ -120,23 +179,26 @@ impl CoordinatorMachine {
         let kinds: BTreeSet<DeviceKind> = node.devices.iter().map(|device| device.info.kind).collect();
         let mut low = false;
         for kind in kinds {
-            let pool = Pool::of(id, node, kind, &self.calibration);
-            let Some(thief) = pool.filter(Pool::is_low) else { continue };
+            let pool = Pool::of(now, id, node, kind, &self.modules);
+            let Some(thief) = pool.filter(|pool| pool.is_low(self.steal_latency.ns())) else { continue };
             low = true;
             if let Some((victim, jobs)) = self.find_loot(now, &thief) {
-                self.order(now, &thief, victim, jobs);
+                self.order(now, (id, kind), victim, jobs);
                 return;
             }
         }
         if low {
-            self.stole_in_vain(now, id);
+            self.pause_looking(now, id);
         }
     }
 
     /// The victim's answer. What it gave up is free, whether or not the steal is still known.
     pub(super) fn retracted(&mut self, now: Instant, victim: NodeId, id: StealId, given_up: &[JobAttempt]) {
         let steal = match self.steals.get(&id) {
-            Some(steal) if steal.victim == victim => self.end_steal(id),
+            Some(steal) if steal.victim == victim => {
+                self.steal_latency.answered(now.since(steal.ordered_at));
+                self.end_steal(id)
+            }
             Some(_) | None => None,
         };
         let mut moved: BTreeMap<AppId, Vec<JobKey>> = BTreeMap::new();
@@ -200,52 +262,58 @@ impl CoordinatorMachine {
     }
 
     /// The jobs that the thief should have, by the victim with the most work left that has any for it.
-    fn find_loot(&self, now: Instant, thief: &Pool) -> Option<(NodeId, Vec<(JobId, Placement)>)> {
-        let mut victims: Vec<Pool> = Vec::new();
+    fn find_loot(&self, now: Instant, thief: &Pool<'_>) -> Option<(NodeId, Vec<(JobId, Placement)>)> {
+        let mut victims: Vec<Pool<'_>> = Vec::new();
         for (&id, node) in self.nodes.iter().filter(|(id, node)| **id != thief.node && can_answer(node)) {
             let kinds: BTreeSet<DeviceKind> = node.devices.iter().map(|device| device.info.kind).collect();
             for kind in kinds {
-                let Some(mut pool) = Pool::of(id, node, kind, &self.calibration) else { continue };
-                pool.queued_ns = (pool.queued_ns - self.leaving_ns(id)).max(0.0);
-                if pool.remaining_ns() > thief.remaining_ns() + 2.0 * STEAL_LATENCY_NS {
+                let Some(mut pool) = Pool::of(now, id, node, kind, &self.modules) else { continue };
+                pool.remaining_ns = (pool.remaining_ns - self.leaving_ns(id)).max(0.0);
+                if pool.has_waiting() {
                     victims.push(pool);
                 }
             }
         }
-        victims.sort_by(|one, other| other.remaining_ns().total_cmp(&one.remaining_ns()));
+        victims.sort_by(|one, other| other.remaining_ns.total_cmp(&one.remaining_ns));
         victims.iter().take(MAX_VICTIMS).find_map(|victim| {
             let jobs = self.loot(now, thief, victim);
             (!jobs.is_empty()).then_some((victim.node, jobs))
         })
     }
 
-    /// From the tail of the victim's queue, as much as makes both finish together.
-    fn loot(&self, now: Instant, thief: &Pool, victim: &Pool) -> Vec<(JobId, Placement)> {
-        let delay = STEAL_LATENCY_NS.max(thief.remaining_ns());
-        let most = thief.rate * (victim.queued_ns - delay * victim.rate) / (victim.rate + thief.rate);
-        if most <= 0.0 {
-            return Vec::new();
-        }
-        let mut taken = 0.0;
+    /// From the tail of the victim's queue, each job that ends sooner on the thief. Where both finish together it ends:
+    /// `x = s_t (R - L s_v) / (s_v + s_t)` of 10-scheduling.md for small jobs, and whole jobs on whole devices for large ones.
+    fn loot(&self, now: Instant, thief: &Pool<'_>, victim: &Pool<'_>) -> Vec<(JobId, Placement)> {
+        let latency_ns = self.steal_latency.ns();
+        let mut free_at_ns = thief.free_at_ns(now);
+        // Time that what was taken so far takes off the victim.
+        let mut spared_ns = 0.0;
         let mut jobs = Vec::new();
-        for (job, place) in self.stealable(now, thief, victim) {
-            let load = place.load_ns as f64;
-            let on_thief = delay + ((taken + load) / thief.rate).max(load / thief.fastest);
-            let on_victim = (victim.queued_ns - taken) / victim.rate;
-            let gain = on_victim - on_thief;
-            let least =
-                if jobs.is_empty() { (2.0 * STEAL_LATENCY_NS).max(LEAST_GAIN * on_victim) } else { 0.0 };
-            if taken + load > most || gain <= least || jobs.len() == MAX_STOLEN_JOBS {
+        for (job, place, fetch_ns) in self.stealable(now, thief, victim) {
+            let amount = place.load.amount as f64;
+            let on_victim = amount / victim.rate(place.load.module);
+            let there = victim.remaining_ns - spared_ns + victim.unevenness() * on_victim;
+            let finish = |(device, free_at): (usize, &f64)| {
+                let job_ns = amount / thief.devices[device].throughput.rate(thief.modules, place.load.module);
+                (device, free_at.max(latency_ns).max(fetch_ns) + job_ns)
+            };
+            let soonest =
+                free_at_ns.iter().enumerate().map(finish).min_by(|(_, one), (_, other)| one.total_cmp(other));
+            let Some((device, here)) = soonest else { break };
+            let least = if jobs.is_empty() { (2.0 * latency_ns).max(LEAST_GAIN * there) } else { 0.0 };
+            if there - here <= least || jobs.len() == MAX_STOLEN_JOBS {
                 break;
             }
-            taken += load;
+            free_at_ns[device] = here;
+            spared_ns += on_victim;
             jobs.push((job, place));
         }
         jobs
     }
 
-    /// The jobs of the victim that the thief may have, last planned first, without those that must be on a device.
-    fn stealable(&self, now: Instant, thief: &Pool, victim: &Pool) -> Vec<(JobId, Placement)> {
+    /// The jobs of the victim that the thief may have, without those that must be on a device, with the time that bringing
+    /// their data takes: those whose data the thief holds first, among them the last planned first.
+    fn stealable(&self, now: Instant, thief: &Pool<'_>, victim: &Pool<'_>) -> Vec<(JobId, Placement, f64)> {
         let (Some(from), Some(to)) = (self.nodes.get(&victim.node), self.nodes.get(&thief.node)) else {
             return Vec::new();
         };
@@ -253,21 +321,32 @@ impl CoordinatorMachine {
         for &id in &from.jobs {
             let Some(JobState::Placed(place)) = self.job(id).map(|job| job.state) else { continue };
             let kind = from.devices.get(usize::from(place.device.0)).map(|device| device.info.kind);
-            if kind == Some(victim.kind) {
+            if place.node == victim.node && kind == Some(victim.kind) {
                 placed.push((place.attempt, id, place));
             }
         }
         placed.sort_unstable_by_key(|(attempt, _, _)| *attempt);
-        placed
+        let mut stealable: Vec<(JobId, Placement, f64)> = placed
             .into_iter()
-            .skip(victim.devices)
+            .skip(victim.devices.len())
             .rev()
             .filter(|(_, id, place)| self.may_move(now, *id, *place, thief, to))
-            .map(|(_, id, place)| (id, place))
-            .collect()
+            .map(|(_, id, place)| (id, place, self.fetch_ns(id, to)))
+            .collect();
+        stealable.sort_by(|(.., one), (.., other)| one.total_cmp(other));
+        stealable
     }
 
-    fn may_move(&self, now: Instant, id: JobId, place: Placement, thief: &Pool, to: &Node) -> bool {
+    /// What bringing a job's contents to a node takes.
+    fn fetch_ns(&self, id: JobId, to: &Node) -> f64 {
+        let batch = self.apps.get(&id.app).and_then(|app| {
+            let job = app.jobs.get(&JobKey::of(id))?;
+            app.batches.get(&job.batch)
+        });
+        batch.map_or(0.0, |batch| to.missing_bytes(&batch.contents) as f64 * FETCH_NS_PER_BYTE)
+    }
+
+    fn may_move(&self, now: Instant, id: JobId, place: Placement, thief: &Pool<'_>, to: &Node) -> bool {
         let Some(app) = self.apps.get(&id.app) else { return false };
         let Some(job) = app.jobs.get(&JobKey::of(id)) else { return false };
         let rested =
@@ -281,11 +360,21 @@ impl CoordinatorMachine {
             && fitting(app, job, to, thief.kind).next().is_some()
     }
 
-    fn order(&mut self, now: Instant, thief: &Pool, victim: NodeId, jobs: Vec<(JobId, Placement)>) {
+    fn order(
+        &mut self,
+        now: Instant,
+        (thief, kind): (NodeId, DeviceKind),
+        victim: NodeId,
+        jobs: Vec<(JobId, Placement)>,
+    ) {
         let id = StealId(self.next_steal);
         self.next_steal += 1;
         let answer_by = now.after(Duration::from_millis(ANSWER_MS));
-        let load_ns = jobs.iter().map(|(_, place)| u128::from(place.load_ns)).sum();
+        let pool = self.nodes.get(&victim).and_then(|node| Pool::of(now, victim, node, kind, &self.modules));
+        let time_on = |pool: Pool<'_>| {
+            jobs.iter().map(|(_, place)| place.load.amount as f64 / pool.rate(place.load.module)).sum()
+        };
+        let leaving_ns = pool.map_or(0.0, time_on);
         let attempts: Vec<JobAttempt> =
             jobs.iter().map(|&(job, place)| JobAttempt { job, attempt: place.attempt }).collect();
         for &job in &attempts {
@@ -294,9 +383,8 @@ impl CoordinatorMachine {
             }
         }
         let jobs = attempts.iter().map(|job| (job.job, job.attempt)).collect();
-        let (thief, kind) = (thief.node, thief.kind);
         tracing::debug!(steal = %id, %thief, %victim, jobs = attempts.len(), "stealing");
-        self.steals.insert(id, Steal { thief, kind, victim, jobs, load_ns, answer_by });
+        self.steals.insert(id, Steal { thief, kind, victim, jobs, leaving_ns, ordered_at: now, answer_by });
         self.arm(answer_by);
         self.tell_node(victim, CoordinatorToNode::Retract { steal: id, jobs: attempts });
     }
@@ -308,7 +396,10 @@ impl CoordinatorMachine {
         };
         let Some(job) = app.jobs.get(&JobKey::of(id)) else { return false };
         let Some(thief) = self.nodes.get(&steal.thief).filter(|node| node.takes_work()) else { return false };
-        let free_at = |device: &Device| device.queued_ns as f64 / device.rate(&self.calibration);
+        let free_at = |device: &Device| {
+            let job_ns = from.load.amount as f64 / device.throughput.rate(&self.modules, from.load.module);
+            device.free_at_ns(now, &self.modules) + job_ns
+        };
         let earliest = fitting(app, job, thief, steal.kind)
             .min_by(|(_, one), (_, other)| free_at(one).total_cmp(&free_at(other)));
         let Some((device, _)) = earliest else { return false };
@@ -320,10 +411,13 @@ impl CoordinatorMachine {
         let place =
             Placement { node: steal.thief, device, attempt, planned_at: now, retracting: None, ..from };
         job.state = JobState::Placed(place);
+        let batch = self.apps.get(&id.app).and_then(|app| app.batches.get(&self.job(id)?.batch));
+        let contents = batch.map_or_else(Vec::new, |batch| batch.contents.clone());
         let Some(thief) = self.nodes.get_mut(&steal.thief) else { return false };
+        thief.will_hold(&contents);
         thief.jobs.insert(id);
         if let Some(device) = thief.device_mut(device) {
-            device.add_load(from.load_ns);
+            device.add_load(now, from.load);
         }
         true
     }
@@ -341,6 +435,15 @@ impl CoordinatorMachine {
         Some(steal)
     }
 
+    /// Nothing worth stealing was found.
+    fn pause_looking(&mut self, now: Instant, id: NodeId) {
+        let nodes = self.nodes.len() as u64;
+        let pause = LOOKING_PAUSE + Duration::from_micros(nodes.saturating_mul(nodes));
+        if let Some(node) = self.nodes.get_mut(&id) {
+            node.steal_at = now.after(pause);
+        }
+    }
+
     fn stole_in_vain(&mut self, now: Instant, id: NodeId) {
         let Some(node) = self.nodes.get_mut(&id) else { return };
         let pause_ms = PAUSE_MS << node.vain_steals.min(MAX_DOUBLINGS);
@@ -354,7 +457,7 @@ impl CoordinatorMachine {
 
     /// What a node was asked to give up.
     fn leaving_ns(&self, victim: NodeId) -> f64 {
-        self.steals.values().filter(|steal| steal.victim == victim).map(|steal| steal.load_ns as f64).sum()
+        self.steals.values().filter(|steal| steal.victim == victim).map(|steal| steal.leaving_ns).sum()
     }
 
     fn is_placed(&self, job: JobId, node: NodeId, attempt: Attempt) -> bool {

@@ -30,15 +30,22 @@ impl Ledger {
     /// I1: each planned job is in exactly one node's set, under its current attempt.
     fn check_places(&self) {
         let mut placed = 0;
+        let mut attempts = 0;
         for (key, job) in &self.jobs {
-            let Some(place) = job.place else { continue };
-            placed += 1;
-            let there = self.nodes.get(&place.life).and_then(|node| node.outstanding.get(&place.attempt));
-            assert_eq!(there, Some(key), "I1: {key} is not where its plan says");
+            placed += u64::from(job.place.is_some());
+            assert!(
+                job.backup.is_none() || job.place.is_some(),
+                "I5: {key} has a second attempt and no first one"
+            );
+            for place in job.placements() {
+                attempts += 1;
+                let there = self.nodes.get(&place.life).and_then(|node| node.outstanding.get(&place.attempt));
+                assert_eq!(there, Some(key), "I1: {key} is not where its plan says");
+            }
         }
         assert_eq!(self.counts.outstanding_jobs, placed, "I1: count of placed jobs");
         let held: u64 = self.nodes.values().map(|node| node.outstanding.len() as u64).sum();
-        assert_eq!(held, placed, "I1: nodes hold exactly the placed jobs");
+        assert_eq!(held, attempts, "I1: nodes hold exactly the attempts planned");
         for (life, node) in &self.nodes {
             match node.link {
                 Link::Connecting | Link::Greeting | Link::Backoff => {

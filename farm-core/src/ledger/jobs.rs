@@ -30,6 +30,15 @@ pub(super) struct Job {
     pub(super) batch: BatchId,
     /// `None` until the first plan.
     pub(super) place: Option<Placement>,
+    /// A second attempt of a placed job beside the first: whichever result comes first counts.
+    pub(super) backup: Option<Placement>,
+}
+
+impl Job {
+    /// The attempts that may deliver.
+    pub(super) fn placements(&self) -> impl Iterator<Item = Placement> + use<> {
+        self.place.into_iter().chain(self.backup)
+    }
 }
 
 /// What the jobs of one plan request share.
@@ -65,7 +74,7 @@ impl Ledger {
                 batch_module = module;
             }
             let batch = BatchId(self.next_batch);
-            self.jobs.insert(key, Job { cost, class, priority, contents, batch, place: None });
+            self.jobs.insert(key, Job { cost, class, priority, contents, batch, place: None, backup: None });
             self.counts.waiting_jobs += 1;
             indices.push(index);
         }
@@ -81,7 +90,12 @@ impl Ledger {
                 let device = device_plan.device;
                 for job in device_plan.jobs.into_iter().filter(|job| job.job.app == app) {
                     let placement = Placement { attempt: job.attempt, life, device };
-                    attempts.extend(self.place(JobKey::of(job.job), placement));
+                    let key = JobKey::of(job.job);
+                    let entered = match plan.speculative {
+                        true => self.place_backup(key, placement),
+                        false => self.place(key, placement),
+                    };
+                    attempts.extend(entered);
                 }
             }
             if !attempts.is_empty() {
@@ -96,18 +110,18 @@ impl Ledger {
         let ResultHeader { job, device: _, device_time_ns, outcome, digest } = header;
         let key = JobKey::of(job.job);
         self.acknowledge(life, job, digest);
-        let counts = self.app() == Some(job.job.app)
-            && self
-                .jobs
-                .get(&key)
-                .and_then(|job| job.place)
-                .is_some_and(|place| place.attempt == job.attempt && place.life == life);
-        if !counts {
+        let placements: Vec<Placement> = match self.jobs.get(&key) {
+            Some(known) if self.app() == Some(job.job.app) => known.placements().collect(),
+            Some(_) | None => Vec::new(),
+        };
+        let is_this = |place: &Placement| place.attempt == job.attempt && place.life == life;
+        if !placements.iter().any(is_this) {
             self.push(Effect::DropPayload { job, digest });
             return;
         }
         match outcome {
             Ok(sections) => {
+                self.stop(job.job, placements.into_iter().filter(|place| !is_this(place)));
                 self.close(key);
                 self.counts.delivered_jobs += 1;
                 self.push(Effect::Deliver { job, sections, device_time_ns, node: life.node });
@@ -117,6 +131,7 @@ impl Ledger {
             Err(failure) if failure.can_be_retried() => self.push(Effect::DropPayload { job, digest }),
             Err(failure) => {
                 self.push(Effect::DropPayload { job, digest });
+                self.stop(job.job, placements.into_iter().filter(|place| !is_this(place)));
                 self.fail(key, job.job, failure);
             }
         }
@@ -138,8 +153,8 @@ impl Ledger {
         // Before the first registration there is no application id yet; the driver keys programs by task and index.
         let app = self.app().unwrap_or(AppId(0));
         for key in keys {
-            if let Some(place) = self.jobs.get(&key).and_then(|job| job.place) {
-                self.cancel_on_node(place.life, JobAttempt { job: key.in_app(app), attempt: place.attempt });
+            if let Some(placements) = self.jobs.get(&key).map(Job::placements) {
+                self.stop(key.in_app(app), placements);
             }
             self.fail(key, key.in_app(app), JobFailure::Cancelled);
         }
@@ -158,7 +173,9 @@ impl Ledger {
             }
             self.counts.outstanding_jobs -= 1;
             self.counts.waiting_jobs += 1;
+            let backup = job.backup.take();
             self.leaves_node(place);
+            backup.into_iter().for_each(|backup| self.leaves_node(backup));
         }
     }
 
@@ -197,6 +214,12 @@ impl Ledger {
             return None;
         };
         match job.place {
+            // The other attempt ended badly; this one goes on alone.
+            Some(current) if job.backup == Some(placement) => {
+                job.place = job.backup.take();
+                self.leaves_node(current);
+                return None;
+            }
             Some(current) if current.attempt > placement.attempt => return None,
             // The same plan again (the coordinator repeats what it holds after a reconnect).
             Some(current) if current == placement => return None,
@@ -205,7 +228,9 @@ impl Ledger {
                 if current.attempt < placement.attempt {
                     self.counts.replanned_jobs += 1;
                 }
+                let backup = job.backup.take();
                 self.leaves_node(current);
+                backup.into_iter().for_each(|backup| self.leaves_node(backup));
             }
             None => {
                 job.place = Some(placement);
@@ -217,6 +242,27 @@ impl Ledger {
             }
         }
         Some(placement.attempt).inspect(|&attempt| self.enters_node(placement.life, attempt, key))
+    }
+
+    /// Takes an attempt in that runs beside the one there is. Returns it if it must be sent.
+    fn place_backup(&mut self, key: JobKey, placement: Placement) -> Option<Attempt> {
+        let Some(job) = self.jobs.get_mut(&key) else { return self.place(key, placement) };
+        let Some(place) = job.place else { return self.place(key, placement) };
+        let newest = job.backup.map_or(place.attempt, |backup| backup.attempt.max(place.attempt));
+        if placement.attempt <= newest {
+            return None;
+        }
+        let before = job.backup.replace(placement);
+        before.into_iter().for_each(|before| self.leaves_node(before));
+        self.enters_node(placement.life, placement.attempt, key);
+        Some(placement.attempt)
+    }
+
+    /// Tells nodes that attempts of a job are of no use any more.
+    fn stop(&mut self, job: JobId, placements: impl Iterator<Item = Placement>) {
+        for place in placements {
+            self.cancel_on_node(place.life, JobAttempt { job, attempt: place.attempt });
+        }
     }
 
     fn fail(&mut self, key: JobKey, job: JobId, failure: JobFailure) {
@@ -249,5 +295,6 @@ impl Ledger {
             }
             None => self.counts.waiting_jobs -= 1,
         }
+        job.backup.into_iter().for_each(|backup| self.leaves_node(backup));
     }
 }

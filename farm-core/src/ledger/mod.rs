@@ -19,7 +19,10 @@ use self::{
 };
 use crate::{
     device::Requirements,
-    id::{AppId, Attempt, BatchId, ContentHash, JobAttempt, JobId, JobIndex, JobKey, NodeId, NodeSession, TaskId},
+    id::{
+        AppId, Attempt, BatchId, ContentHash, JobAttempt, JobId, JobIndex, JobKey, NodeId, NodeSession,
+        TaskId,
+    },
     message::{
         AppHello, AppToCoordinator, AppToNode, Contact, CoordinatorToApp, CostNs, JobFailure, LatencyClass,
         Liveness, NodeToApp, Priority, WaitReason,
@@ -298,9 +301,9 @@ impl Ledger {
 
     /// The jobs that are not over, each with the node that its current plan names and the attempt there.
     pub fn open_jobs(&self) -> impl Iterator<Item = (TaskId, JobIndex, Option<(NodeId, Attempt)>)> {
-        self.jobs.iter().map(|(key, job)| {
-            (key.task, key.index, job.place.map(|place| (place.life.node, place.attempt)))
-        })
+        self.jobs
+            .iter()
+            .map(|(key, job)| (key.task, key.index, job.place.map(|place| (place.life.node, place.attempt))))
     }
 
     fn push(&mut self, effect: Effect) {

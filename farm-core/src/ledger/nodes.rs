@@ -322,7 +322,7 @@ impl Ledger {
             // Moved, delivered or cancelled meanwhile: nothing to send.
             let Some(key) = node.outstanding.get(attempt) else { continue };
             let Some(job) = self.jobs.get(key) else { continue };
-            let Some(place) = job.place else { continue };
+            let Some(place) = job.placements().find(|place| place.attempt == *attempt) else { continue };
             tickets.push(JobTicket {
                 job: JobAttempt { job: key.in_app(app), attempt: *attempt },
                 device: place.device,

@@ -68,9 +68,10 @@ fn headline(status: &FarmStatus) -> String {
     };
     format!(
         "{word}  nodes: {nodes}  devices: {busy} of {} busy  jobs: {outstanding} placed, {waiting} waiting, {} delivered, \
-         {} replanned  (coordinator {})\n",
+         {} stolen, {} replanned  (coordinator {})\n",
         devices.len(),
         status.delivered_jobs,
+        status.stolen_jobs,
         status.replanned_jobs,
         status.epoch,
     )
@@ -180,6 +181,9 @@ mod tests {
             apps: vec![app],
             delivered_jobs: 7,
             replanned_jobs: 0,
+            stolen_jobs: 0,
+            speculations: 0,
+            policy_fallbacks: 0,
         }
     }
 

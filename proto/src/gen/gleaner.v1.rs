@@ -346,6 +346,15 @@ pub struct FarmStatus {
     /// New attempts after a loss since this start.
     #[prost(uint64, tag = "5")]
     pub replanned_jobs: u64,
+    /// Jobs moved between nodes by stealing since this start.
+    #[prost(uint64, tag = "6")]
+    pub stolen_jobs: u64,
+    /// Second attempts beside running ones since this start.
+    #[prost(uint64, tag = "7")]
+    pub speculations: u64,
+    /// Batches placed first come, first served since this start because a plug-in failed.
+    #[prost(uint64, tag = "8")]
+    pub policy_fallbacks: u64,
 }
 /// How a node stands.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]
@@ -905,6 +914,9 @@ pub struct Plan {
     /// Grouped by node.
     #[prost(message, repeated, tag = "2")]
     pub nodes: ::prost::alloc::vec::Vec<NodePlan>,
+    /// These attempts are in addition to those that run already; the first result counts.
+    #[prost(bool, tag = "3")]
+    pub speculative: bool,
 }
 /// Attempts placed on one node.
 #[derive(Clone, PartialEq, ::prost::Message)]

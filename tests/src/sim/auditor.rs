@@ -42,6 +42,8 @@ pub struct Checks {
     pub lags: u64,
     /// Steals (I9).
     pub steals: u64,
+    /// Second attempts beside running ones (I5).
+    pub speculations: u64,
     /// Jobs looked for in all three tiers at once (I1).
     pub whereabouts: u64,
     /// Rounds of the machines' own checks (I1, I2, I8).
@@ -58,6 +60,7 @@ impl Checks {
             idle_devices: self.idle_devices + other.idle_devices,
             lags: self.lags + other.lags,
             steals: self.steals + other.steals,
+            speculations: self.speculations + other.speculations,
             whereabouts: self.whereabouts + other.whereabouts,
             books: self.books + other.books,
         }
@@ -74,10 +77,20 @@ struct Record {
     workers: Vec<usize>,
     /// The last attempt, and the node it was planned on.
     newest: Option<(Attempt, NodeId)>,
+    /// Attempts beside another one.
+    speculations: u32,
     /// Steals under one registration of its application with one coordinator.
     steals: u32,
     /// Nodes that it was stolen from since it last started.
     left: Vec<NodeId>,
+}
+
+impl Record {
+    fn worked_on(&mut self, worker: usize) {
+        if !self.workers.contains(&worker) {
+            self.workers.push(worker);
+        }
+    }
 }
 
 /// An answer to a retract order.
@@ -159,7 +172,11 @@ impl Auditor {
         for node in &plan.nodes {
             let worker = worker_at(&node.contact.addresses[0]);
             for &job in node.devices.iter().flat_map(|device| &device.jobs) {
-                self.placed(job, node.node, worker);
+                if plan.speculative {
+                    self.speculated(job, worker);
+                } else {
+                    self.placed(job, node.node, worker);
+                }
             }
         }
     }
@@ -170,9 +187,7 @@ impl Auditor {
         if let Some((newest, _)) = before {
             assert!(newest <= job.attempt, "I4: {job} is planned after {newest}");
         }
-        if !record.workers.contains(&worker) {
-            record.workers.push(worker);
-        }
+        record.worked_on(worker);
         if self.moving.left > 0 && self.moving.jobs.remove(&job.job) {
             self.moving.left -= 1;
             self.checks.steals += 1;
@@ -181,6 +196,16 @@ impl Auditor {
             assert!(record.steals <= MAX_STEALS, "I9: {} was stolen {} times", job.job, record.steals);
             assert!(!record.left.contains(&node), "I9: {} is stolen back to {node}, unstarted", job.job);
         }
+    }
+
+    /// A second attempt beside the first: that one stays the one that others are compared with.
+    fn speculated(&mut self, job: JobAttempt, worker: usize) {
+        self.checks.speculations += 1;
+        let record = self.jobs.entry(job.job).or_default();
+        let first = record.newest.map(|(attempt, _)| attempt);
+        assert!(first.is_some_and(|first| first < job.attempt), "I4: {job} is planned beside {first:?}");
+        record.speculations += 1;
+        record.worked_on(worker);
     }
 
     /// The answer to a retract order in an event, if it is one.
@@ -209,11 +234,11 @@ impl Auditor {
         let record = self.jobs.entry(job).or_default();
         record.executions += 1;
         record.left.clear();
-        let (executions, crashes) = (record.executions, record.crashes);
+        let (executions, own) = (record.executions, record.crashes + record.speculations);
         if executions == 1 {
             return;
         }
-        let most = 1 + crashes + self.disturbances_of(job) + self.count(Proc::Worker(worker));
+        let most = 1 + own + self.disturbances_of(job) + self.count(Proc::Worker(worker));
         assert!(
             executions <= most,
             "I5: {job} is executed {executions} times, now on worker {worker}, though only {most} are accounted for"

@@ -20,6 +20,9 @@ impl From<FarmStatus> for v1::FarmStatus {
             apps: status.apps.into_iter().map(Into::into).collect(),
             delivered_jobs: status.delivered_jobs,
             replanned_jobs: status.replanned_jobs,
+            stolen_jobs: status.stolen_jobs,
+            speculations: status.speculations,
+            policy_fallbacks: status.policy_fallbacks,
         }
     }
 }
@@ -34,6 +37,9 @@ impl TryFrom<v1::FarmStatus> for FarmStatus {
             apps: list("FarmStatus.apps", MAX_ENTRIES, wire.apps)?,
             delivered_jobs: wire.delivered_jobs,
             replanned_jobs: wire.replanned_jobs,
+            stolen_jobs: wire.stolen_jobs,
+            speculations: wire.speculations,
+            policy_fallbacks: wire.policy_fallbacks,
         })
     }
 }

@@ -220,7 +220,8 @@ impl From<Plan> for v1::Plan {
             contact: Some(node.contact.into()),
             devices: node.devices.into_iter().map(Into::into).collect(),
         });
-        Self { batch: plan.batch.map(|batch| batch.0), nodes: nodes.collect() }
+        let batch = plan.batch.map(|batch| batch.0);
+        Self { batch, nodes: nodes.collect(), speculative: plan.speculative }
     }
 }
 
@@ -228,7 +229,8 @@ impl TryFrom<v1::Plan> for Plan {
     type Error = WireError;
 
     fn try_from(wire: v1::Plan) -> Result<Self, WireError> {
-        Ok(Self { batch: wire.batch.map(BatchId), nodes: list("Plan.nodes", MAX_ENTRIES, wire.nodes)? })
+        let nodes = list("Plan.nodes", MAX_ENTRIES, wire.nodes)?;
+        Ok(Self { batch: wire.batch.map(BatchId), speculative: wire.speculative, nodes })
     }
 }
 

@@ -1,0 +1,208 @@
+//! What devices are worth: a rate for each (module, device), learnt from completed jobs, and for pairs without a
+//! completed job an estimate from the device's score (10-scheduling.md section 1).
+//!
+//! Loads are in the unit of their module's applications (nanoseconds at speed 1.0 where they give costs), so rates of two
+//! modules are never compared: only the times that follow from them are.
+
+use std::collections::BTreeMap;
+
+use crate::id::ContentHash;
+
+/// Weight of a new throughput sample in a rate. 0.2 follows a change of speed within ten jobs and lets one outlier
+/// move the rate by a fifth at most of its (bounded) distance.
+const RATE_GAIN: f64 = 0.2;
+
+/// A sample counts as at most this many times faster or slower than the rate so far: one warm-up launch or one job of
+/// wrong cost must not starve or flood a device.
+const MAX_RATE_STEP: f64 = 16.0;
+
+/// Most modules with a scale of their own; beyond it the one that was asked for longest ago is forgotten.
+const MAX_MODULES: usize = 1_024;
+
+/// Most modules that one device keeps a rate for; beyond it one without queued jobs is forgotten.
+const MAX_DEVICE_MODULES: usize = 64;
+
+/// A module that jobs launch, or none, by a number of this coordinator's own.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub(super) struct Module(u32);
+
+/// What a job adds to a device's queue.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct Load {
+    pub(super) module: Module,
+    /// In the unit of the module's jobs.
+    pub(super) amount: u64,
+}
+
+/// The modules known, and for each what a point of score is worth: what makes the scores of devices without a completed
+/// job comparable with the measured rates of the others.
+#[derive(Debug, Default)]
+pub(super) struct Modules {
+    known: BTreeMap<Option<ContentHash>, Module>,
+    entries: BTreeMap<Module, Entry>,
+    /// Over all modules: the guess for a new one.
+    overall: Mean,
+    next: u32,
+    uses: u64,
+}
+
+#[derive(Debug)]
+struct Entry {
+    name: Option<ContentHash>,
+    scale: Mean,
+    last_use: u64,
+}
+
+impl Modules {
+    pub(super) fn named(&mut self, name: Option<ContentHash>) -> Module {
+        self.uses += 1;
+        if let Some(&module) = self.known.get(&name) {
+            if let Some(entry) = self.entries.get_mut(&module) {
+                entry.last_use = self.uses;
+            }
+            return module;
+        }
+        if self.entries.len() >= MAX_MODULES
+            && let Some((&oldest, _)) = self.entries.iter().min_by_key(|(_, entry)| entry.last_use)
+            && let Some(entry) = self.entries.remove(&oldest)
+        {
+            self.known.remove(&entry.name);
+        }
+        let module = Module(self.next);
+        self.next = self.next.wrapping_add(1);
+        self.known.insert(name, module);
+        self.entries.insert(module, Entry { name, scale: Mean::default(), last_use: self.uses });
+        module
+    }
+
+    /// Whether a job of it was completed.
+    pub(super) fn is_known(&self, module: Module) -> bool {
+        self.entries.get(&module).is_some_and(|entry| entry.scale.0.is_some())
+    }
+
+    /// Load per time that a point of score stands for.
+    fn scale(&self, module: Module) -> f64 {
+        let own = self.entries.get(&module).and_then(|entry| entry.scale.0);
+        own.or(self.overall.0).unwrap_or(1.0)
+    }
+
+    fn observe(&mut self, module: Module, sample: f64) {
+        self.overall.observe(sample);
+        if let Some(entry) = self.entries.get_mut(&module) {
+            entry.scale.observe(sample);
+        }
+    }
+}
+
+/// What a device has queued and what it is worth, by module.
+#[derive(Debug)]
+pub(super) struct Throughput {
+    score: f64,
+    /// How much faster than its score says, compared with the others.
+    bias: Mean,
+    /// Few: searched from the front.
+    modules: Vec<ModuleThroughput>,
+}
+
+#[derive(Debug)]
+struct ModuleThroughput {
+    module: Module,
+    rate: Mean,
+    queued: u128,
+    jobs: u64,
+}
+
+impl Throughput {
+    pub(super) const fn new(score: f64) -> Self {
+        Self { score, bias: Mean(None), modules: Vec::new() }
+    }
+
+    /// Load of a module per nanosecond.
+    pub(super) fn rate(&self, modules: &Modules, module: Module) -> f64 {
+        let measured = self.find(module).and_then(|found| found.rate.0);
+        measured.unwrap_or_else(|| self.points() * modules.scale(module))
+    }
+
+    /// How long what is queued takes, in nanoseconds.
+    pub(super) fn queued_ns(&self, modules: &Modules) -> f64 {
+        let queued = self.modules.iter().filter(|found| found.jobs > 0);
+        queued.map(|found| found.queued as f64 / self.rate(modules, found.module)).sum()
+    }
+
+    /// What is queued of each module.
+    pub(super) fn queued(&self) -> impl Iterator<Item = (Module, u128)> {
+        self.modules.iter().filter(|found| found.jobs > 0).map(|found| (found.module, found.queued))
+    }
+
+    pub(super) fn add(&mut self, load: Load) {
+        let index = match self.modules.iter().position(|found| found.module == load.module) {
+            Some(index) => index,
+            None => {
+                self.forget_idle();
+                self.modules.push(ModuleThroughput {
+                    module: load.module,
+                    rate: Mean(None),
+                    queued: 0,
+                    jobs: 0,
+                });
+                self.modules.len() - 1
+            }
+        };
+        self.modules[index].queued += u128::from(load.amount);
+        self.modules[index].jobs += 1;
+    }
+
+    pub(super) fn remove(&mut self, load: Load) {
+        let found = self.modules.iter_mut().find(|found| found.module == load.module);
+        let found = found.expect("what was added is kept until it is removed");
+        found.queued -= u128::from(load.amount);
+        found.jobs -= 1;
+    }
+
+    /// Learns from one completed job.
+    pub(super) fn completed(&mut self, modules: &mut Modules, load: Load, device_time_ns: u64) {
+        if load.amount == 0 || device_time_ns == 0 {
+            return;
+        }
+        let sample = load.amount as f64 / device_time_ns as f64;
+        modules.observe(load.module, sample / self.points());
+        self.bias.observe(sample / (self.score * modules.scale(load.module)));
+        let prior = self.points() * modules.scale(load.module);
+        if let Some(found) = self.modules.iter_mut().find(|found| found.module == load.module) {
+            found.rate.0.get_or_insert(prior);
+            found.rate.observe(sample);
+        }
+    }
+
+    fn points(&self) -> f64 {
+        self.score * self.bias.0.unwrap_or(1.0)
+    }
+
+    fn find(&self, module: Module) -> Option<&ModuleThroughput> {
+        self.modules.iter().find(|found| found.module == module)
+    }
+
+    fn forget_idle(&mut self) {
+        if self.modules.len() >= MAX_DEVICE_MODULES
+            && let Some(idle) = self.modules.iter().position(|found| found.jobs == 0)
+        {
+            self.modules.remove(idle);
+        }
+    }
+}
+
+/// A mean of positive samples that forgets the older ones; `None` before the first.
+#[derive(Clone, Copy, Debug, Default)]
+struct Mean(Option<f64>);
+
+impl Mean {
+    fn observe(&mut self, sample: f64) {
+        self.0 = Some(match self.0 {
+            None => sample,
+            Some(so_far) => {
+                let sample = sample.clamp(so_far / MAX_RATE_STEP, so_far * MAX_RATE_STEP);
+                so_far + RATE_GAIN * (sample - so_far)
+            }
+        });
+    }
+}

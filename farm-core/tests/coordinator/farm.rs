@@ -1,0 +1,206 @@
+//! A coordinator with one application and nodes of one device each, driven by hand.
+
+use std::{collections::BTreeMap, time::Duration};
+
+use farm_core::{
+    coordinator::{
+        CoordinatorConfig, CoordinatorMachine, Effect, Event,
+        policy::{Question, QuestionId},
+    },
+    device::{DeviceInfo, DeviceKind, Features, Limits, Requirements},
+    id::{BatchId, ContentHash, DeviceIndex, Epoch, JobAttempt, JobIndex, LinkId, NodeSession, TaskId},
+    message::{
+        AppHello, AppToCoordinator, Contact, CoordinatorToApp, CoordinatorToNode, CostNs, DeviceLoad,
+        Executed, JobFailure, JobTrace, NodeHello, NodeToCoordinator, PROTOCOL_VERSION, Plan, PlanJob,
+        PlanRequest, RunningJob,
+    },
+    program::Content,
+    time::Instant,
+};
+
+const APP: LinkId = LinkId(0);
+pub(crate) const MILLISECOND_NS: u64 = 1_000_000;
+
+/// A coordinator with one application and nodes of one device each, driven by hand.
+pub(crate) struct Farm {
+    pub(crate) machine: CoordinatorMachine,
+    pub(crate) now: Instant,
+    batches: u64,
+    pub(crate) questions: Vec<(QuestionId, String, Question)>,
+    pub(crate) refused: Option<String>,
+    /// Whether the last plan was of second attempts.
+    pub(crate) speculative: bool,
+    /// By node, in order.
+    pub(crate) cancelled: Vec<(u64, JobAttempt)>,
+}
+
+impl Farm {
+    pub(crate) fn new(policy: &str, scores: &[f64]) -> Self {
+        let config = CoordinatorConfig {
+            plugins: ["spread".to_owned()].into(),
+            ..CoordinatorConfig::new(Epoch(1), 1)
+        };
+        let machine = CoordinatorMachine::new(config);
+        let mut farm = Self {
+            machine,
+            now: Instant::ZERO,
+            batches: 0,
+            questions: Vec::new(),
+            refused: None,
+            speculative: false,
+            cancelled: Vec::new(),
+        };
+        for (node, &score) in (1..).zip(scores) {
+            farm.node_joins(node, score);
+        }
+        let hello = AppHello {
+            protocol: PROTOCOL_VERSION,
+            name: "app".to_owned(),
+            weight: 1.0,
+            global_stealing: true,
+            policy: policy.to_owned(),
+            resume: None,
+        };
+        farm.say(AppToCoordinator::Hello(hello));
+        farm
+    }
+
+    pub(crate) fn node_joins(&mut self, node: u64, score: f64) {
+        let info = DeviceInfo {
+            name: "sim".to_owned(),
+            kind: DeviceKind::Simulated,
+            score,
+            features: Features::default(),
+            limits: Limits::UNBOUNDED,
+        };
+        let message = NodeToCoordinator::Hello(NodeHello {
+            protocol: PROTOCOL_VERSION,
+            name: format!("node {node}"),
+            session: NodeSession(node),
+            devices: vec![info],
+            contact: Contact { addresses: Vec::new(), certificate_der: Vec::new() },
+            inventory: Vec::new(),
+        });
+        self.handle(Event::FromNode { link: LinkId(node), message });
+    }
+
+    fn say(&mut self, message: AppToCoordinator) -> BTreeMap<u64, Vec<JobAttempt>> {
+        self.handle(Event::FromApp { link: APP, message })
+    }
+
+    /// Takes an event in; gives the jobs planned in answer, by node.
+    pub(crate) fn handle(&mut self, event: Event) -> BTreeMap<u64, Vec<JobAttempt>> {
+        self.machine.handle(self.now, event);
+        self.settle()
+    }
+
+    pub(crate) fn settle(&mut self) -> BTreeMap<u64, Vec<JobAttempt>> {
+        self.machine.check_invariants();
+        let mut planned: BTreeMap<u64, Vec<JobAttempt>> = BTreeMap::new();
+        while let Some(effect) = self.machine.poll_effect() {
+            match effect {
+                Effect::ToApp {
+                    message: CoordinatorToApp::Plan(Plan { nodes, speculative, .. }), ..
+                } => {
+                    self.speculative = speculative;
+                    for node in nodes {
+                        let jobs = node.devices.into_iter().flat_map(|device| device.jobs);
+                        planned.entry(node.session.0).or_default().extend(jobs);
+                    }
+                }
+                Effect::ToApp { message: CoordinatorToApp::Refused { reason }, .. } => {
+                    self.refused = Some(reason);
+                }
+                Effect::ToNode { link, message: CoordinatorToNode::Cancel { jobs } } => {
+                    self.cancelled.extend(jobs.into_iter().map(|job| (link.0, job)));
+                }
+                Effect::AskPolicy { id, plugin, question } => self.questions.push((id, plugin, question)),
+                Effect::ToApp { .. } | Effect::ToNode { .. } | Effect::Close { .. } => {}
+            }
+        }
+        planned
+    }
+
+    pub(crate) fn plan(
+        &mut self,
+        costs_ms: &[u64],
+        module: u8,
+        contents: &[Content],
+    ) -> BTreeMap<u64, Vec<JobAttempt>> {
+        self.batches += 1;
+        let jobs = (0..).zip(costs_ms).map(|(index, cost_ms)| PlanJob {
+            index: JobIndex(index),
+            cost: CostNs(cost_ms * MILLISECOND_NS),
+        });
+        let request = PlanRequest {
+            batch: BatchId(self.batches),
+            task: TaskId(u32::try_from(self.batches).unwrap()),
+            jobs: jobs.collect(),
+            needs: Requirements::ANY,
+            module: Some(ContentHash([module; 32])),
+            contents: contents.to_vec(),
+        };
+        self.say(AppToCoordinator::Plan(request))
+    }
+
+    /// A node says that it lives, and what its device has run for how many nanoseconds.
+    pub(crate) fn heartbeat(
+        &mut self,
+        node: u64,
+        running: Option<(JobAttempt, u64)>,
+    ) -> BTreeMap<u64, Vec<JobAttempt>> {
+        let running = running.map(|(job, for_ns)| RunningJob { job, for_ns });
+        let devices = vec![DeviceLoad { queued_jobs: 0, running }];
+        let message = NodeToCoordinator::Heartbeat { sequence: 1, devices, spool_bytes: 0 };
+        self.handle(Event::FromNode { link: LinkId(node), message })
+    }
+
+    pub(crate) fn leaves(&mut self, node: u64) -> BTreeMap<u64, Vec<JobAttempt>> {
+        self.handle(Event::FromNode { link: LinkId(node), message: NodeToCoordinator::Goodbye })
+    }
+
+    /// A node's connection is gone: it gets nothing new.
+    pub(crate) fn stop_taking(&mut self, node: u64) {
+        self.handle(Event::LinkClosed { link: LinkId(node) });
+    }
+
+    pub(crate) fn failed(
+        &mut self,
+        node: u64,
+        job: JobAttempt,
+        failure: JobFailure,
+    ) -> BTreeMap<u64, Vec<JobAttempt>> {
+        self.report(node, job, 0, Some(failure))
+    }
+
+    pub(crate) fn open_jobs(&self) -> u64 {
+        self.machine.status().apps.iter().map(|app| app.waiting_jobs + app.outstanding_jobs).sum()
+    }
+
+    fn report(
+        &mut self,
+        node: u64,
+        job: JobAttempt,
+        device_time_ns: u64,
+        failure: Option<JobFailure>,
+    ) -> BTreeMap<u64, Vec<JobAttempt>> {
+        let delivered = if failure.is_none() { vec![job] } else { Vec::new() };
+        let (device, trace) = (DeviceIndex(0), JobTrace::default());
+        let executed = vec![Executed { job, device, device_time_ns, trace, failure }];
+        let message = NodeToCoordinator::Report { sent_at: self.now, executed, delivered };
+        self.handle(Event::FromNode { link: LinkId(node), message })
+    }
+
+    /// A node has executed and delivered jobs, each in the time that `took_ms` says.
+    pub(crate) fn done(&mut self, node: u64, jobs: &[JobAttempt], took_ms: impl Fn(JobAttempt) -> u64) {
+        for &job in jobs {
+            let device_time_ns = took_ms(job) * MILLISECOND_NS;
+            self.now = self.now.after(Duration::from_nanos(device_time_ns));
+            self.report(node, job, device_time_ns, None);
+        }
+    }
+}
+
+pub(crate) fn count(planned: &BTreeMap<u64, Vec<JobAttempt>>, node: u64) -> usize {
+    planned.get(&node).map_or(0, Vec::len)
+}

@@ -1,0 +1,7 @@
+//! The coordinator's machine by itself: what it decides, seen from its effects.
+
+#![allow(clippy::unwrap_used, reason = "a test that cannot go on panics")]
+
+mod farm;
+mod policies;
+mod speculation;

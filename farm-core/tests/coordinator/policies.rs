@@ -1,0 +1,155 @@
+//! Which device a job goes to: rates per module, data that is there, and the policies an application may choose.
+
+use std::time::Duration;
+
+use farm_core::id::LinkId;
+use farm_core::{
+    coordinator::{Event, policy::Choice},
+    id::{ContentHash, JobAttempt},
+    message::NodeToCoordinator,
+    program::Content,
+};
+
+use crate::farm::{Farm, count};
+
+#[test]
+fn devices_are_rated_for_each_module_by_itself() {
+    let mut farm = Farm::new("", &[1_000.0, 1_000.0]);
+    // Equal by score; the first is three times as fast for module 1, the second for module 2.
+    for module in [1, 2] {
+        for _ in 0..10 {
+            let planned = farm.plan(&[10; 8], module, &[]);
+            for (node, jobs) in planned {
+                let fast = node == u64::from(module);
+                farm.done(node, &jobs, |_| if fast { 5 } else { 15 });
+            }
+        }
+    }
+    for module in [1, 2] {
+        let planned = farm.plan(&[10; 40], module, &[]);
+        let fast = count(&planned, module.into());
+        assert!((28..=32).contains(&fast), "three quarters of 40 belong to the faster one, not {fast}");
+        planned.into_iter().for_each(|(node, jobs)| farm.done(node, &jobs, |_| 10));
+    }
+}
+
+#[test]
+fn a_node_that_has_the_data_is_preferred_until_its_queue_is_longer_than_the_transfer() {
+    // 117 MB: a second on gigabit Ethernet.
+    let scene = Content { hash: ContentHash([9; 32]), size_bytes: 117_000_000 };
+    let mut farm = Farm::new("", &[1_000.0]);
+    let planned = farm.plan(&[100], 1, &[scene]);
+    farm.done(1, &planned[&1], |_| 100);
+    farm.node_joins(2, 1_000.0);
+    let planned = farm.plan(&[100; 8], 1, &[scene]);
+    assert_eq!(
+        (count(&planned, 1), count(&planned, 2)),
+        (8, 0),
+        "0.8 s of work are no reason to move 1 s of data"
+    );
+    planned.into_iter().for_each(|(node, jobs)| farm.done(node, &jobs, |_| 100));
+    let planned = farm.plan(&[100; 30], 1, &[scene]);
+    assert_eq!((count(&planned, 1), count(&planned, 2)), (20, 10), "3 s are: both end after 2 s");
+    planned.into_iter().for_each(|(node, jobs)| farm.done(node, &jobs, |_| 100));
+    let planned = farm.plan(&[100; 8], 1, &[scene]);
+    assert_eq!((count(&planned, 1), count(&planned, 2)), (4, 4), "now both have it");
+}
+
+#[test]
+fn history_knows_what_the_same_jobs_took_and_puts_the_longest_first() {
+    let took = |job: JobAttempt| if job.job.index.0 == 5 { 400 } else { 10 + u64::from(job.job.index.0) };
+    let second_frame = |policy| {
+        let mut farm = Farm::new(policy, &[1_000.0, 1_000.0]);
+        for (node, jobs) in farm.plan(&[0; 12], 1, &[]) {
+            farm.done(node, &jobs, took);
+        }
+        farm.plan(&[0; 12], 1, &[])
+    };
+    let planned = second_frame("history");
+    let longest = planned.iter().find(|(_, jobs)| jobs.iter().any(|job| job.job.index.0 == 5)).unwrap();
+    assert_eq!(longest.1[0].job.index.0, 5, "the longest is first in its queue");
+    assert!(longest.1.len() <= 3, "and nearly alone: {longest:?}");
+    let planned = second_frame("fcfs");
+    assert!(
+        planned.values().all(|jobs| (4..=8).contains(&jobs.len())),
+        "without memory all look alike: {planned:?}"
+    );
+}
+
+#[test]
+fn an_unknown_policy_is_refused_by_name() {
+    let farm = Farm::new("nonesuch", &[1.0]);
+    let reason = farm.refused.unwrap();
+    assert!(reason.contains("`nonesuch`") && reason.contains("fcfs, history, spread"), "{reason}");
+}
+
+#[test]
+fn a_plug_in_places_a_batch() {
+    let mut farm = Farm::new("spread", &[1.0, 1_000.0]);
+    assert!(farm.plan(&[10; 3], 1, &[]).is_empty(), "not before it answered");
+    let (id, plugin, question) = farm.questions.pop().unwrap();
+    assert_eq!((plugin.as_str(), question.jobs.len(), question.devices.len()), ("spread", 3, 2));
+    let answer = Ok([2, 0, 1].map(|job| Choice { job, device: 0 }).to_vec());
+    let planned = farm.handle(Event::PolicyAnswered { question: id, answer });
+    let order: Vec<u32> = planned[&1].iter().map(|job| job.job.index.0).collect();
+    assert_eq!(order, [2, 0, 1], "all on the slow one, in the order it said");
+    assert_eq!(farm.machine.status().policy_fallbacks, 0);
+}
+
+#[test]
+fn a_plug_in_that_fails_or_answers_nonsense_is_passed_over() {
+    let choice = |job, device| Choice { job, device };
+    let answers = [
+        Err("crashed with signal 11".to_owned()),
+        Ok(vec![]),
+        Ok(vec![choice(0, 0), choice(0, 0)]),
+        Ok(vec![choice(0, 0), choice(2, 0)]),
+        Ok(vec![choice(0, 0), choice(1, 2)]),
+    ];
+    for answer in answers {
+        let mut farm = Farm::new("spread", &[1.0, 1_000.0]);
+        farm.plan(&[10; 2], 1, &[]);
+        let (question, ..) = farm.questions.pop().unwrap();
+        let planned = farm.handle(Event::PolicyAnswered { question, answer: answer.clone() });
+        assert_eq!(count(&planned, 2), 2, "first come, first served to the faster one after {answer:?}");
+        assert_eq!(farm.machine.status().policy_fallbacks, 1);
+        let late =
+            farm.handle(Event::PolicyAnswered { question, answer: Ok(vec![choice(0, 0), choice(1, 0)]) });
+        assert!(late.is_empty(), "a second answer changes nothing");
+    }
+}
+
+#[test]
+fn a_slow_plug_in_is_not_waited_for_and_not_asked_again_after_three_times() {
+    let mut farm = Farm::new("spread", &[1.0]);
+    for round in 0..4 {
+        let at_once = farm.plan(&[10; 2], 1, &[]);
+        if round == 3 {
+            assert_eq!(count(&at_once, 1), 2, "not asked any more");
+            break;
+        }
+        assert!(at_once.is_empty(), "asked");
+        farm.now = farm.machine.poll_timeout().unwrap();
+        farm.machine.handle_timeout(farm.now);
+        assert_eq!(count(&farm.settle(), 1), 2, "placed when its time was over");
+    }
+    assert_eq!(farm.questions.len(), 3);
+    farm.now = farm.now.after(Duration::from_secs(61));
+    assert!(farm.plan(&[10; 2], 1, &[]).is_empty(), "a minute later it gets another chance");
+}
+
+#[test]
+fn a_device_that_went_while_a_plug_in_thought_takes_nothing() {
+    let mut farm = Farm::new("spread", &[1.0, 1.0]);
+    farm.plan(&[10; 2], 1, &[]);
+    let (question, _, asked) = farm.questions.pop().unwrap();
+    farm.handle(Event::FromNode { link: LinkId(1), message: NodeToCoordinator::Goodbye });
+    let gone = asked.devices.iter().position(|device| device.node.0 == 1).unwrap();
+    let device = u32::try_from(gone).unwrap();
+    let answer = Ok([0, 1].map(|job| Choice { job, device }).to_vec());
+    assert!(farm.handle(Event::PolicyAnswered { question, answer }).is_empty(), "asked again instead");
+    let (question, _, asked) = farm.questions.pop().unwrap();
+    assert_eq!(asked.devices.len(), 1, "of the farm as it is");
+    let answer = Ok([0, 1].map(|job| Choice { job, device: 0 }).to_vec());
+    assert_eq!(count(&farm.handle(Event::PolicyAnswered { question, answer }), 2), 2);
+}
