@@ -239,6 +239,19 @@ impl Ledger {
         }
     }
 
+    /// A ledger of an application that comes back as another process. `first_batch` is larger than any number that an
+    /// earlier one gave a batch: the application's journal knows it by [`Self::next_batch`].
+    #[must_use]
+    pub fn resumed(hello: AppHello, first_batch: BatchId) -> Self {
+        Self { next_batch: first_batch.0, ..Self::new(hello) }
+    }
+
+    /// The number that the next batch will have.
+    #[must_use]
+    pub const fn next_batch(&self) -> BatchId {
+        BatchId(self.next_batch)
+    }
+
     /// Takes one event in.
     pub fn handle(&mut self, now: Instant, event: Event) {
         if self.session == Session::Finished {

@@ -259,7 +259,8 @@ impl World {
         let host = &mut self.apps[index];
         host.state = State::Up;
         host.clock = clock;
-        host.ledger = Ledger::new(hello(host.index, host.global_stealing, host.identity));
+        let hello = hello(host.index, host.global_stealing, host.identity);
+        host.ledger = Ledger::resumed(hello, host.ledger.next_batch());
         for Submission { task, mut jobs, needs } in std::mem::take(&mut host.submitted) {
             jobs.retain(|job| !self.apps[index].endings.contains_key(&(task, job.index)));
             self.app_event(index, Event::Submitted { task, jobs, needs });
