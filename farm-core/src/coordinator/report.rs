@@ -49,11 +49,10 @@ impl CoordinatorMachine {
             ended;
         let job = JobAttempt { job: id, attempt };
         if self.is_backup(job, node) {
-            if failure.as_ref().is_some_and(JobFailure::can_be_retried) {
-                self.drop_backup(id);
-                return;
+            match failure {
+                Some(failure) if failure.can_be_retried() => return self.backup_failed(id, failure, node),
+                Some(_) | None => self.first_one_loses(id),
             }
-            self.first_one_loses(id);
         }
         // Reports of attempts that were replaced meanwhile change nothing.
         if self.holder(id) != Some((node, attempt)) {
