@@ -13,14 +13,18 @@ use tests::sim::{
 use crate::all_delivered;
 
 /// Seeds that found something, by scenario. They mean what they meant as long as a farm draws as it did.
-const SEEDS: [(&str, &[u64]); 3] = [
+const SEEDS: [(&str, &[u64]); 4] = [
     // A plan request lost after a change of coordinator, a welcome lost after one, a result that crossed a goodbye.
     ("storm", &[82, 1_302, 365]),
-    // 78: a content that nobody with a link waited for was never asked for again.
-    ("weather", &[78]),
+    // 78: a content that nobody with a link waited for was never asked for again. 165: an application that resumed
+    // numbered its batches from zero again, and was expelled for a number it had used. 305: crashes of second attempts
+    // did not count.
+    ("weather", &[78, 165, 305]),
     // 17, 48, 143: an application that resumed without its memory was not told of jobs that had been executed, threw
-    // their results away, and waited for them for ever.
-    ("lives", &[17, 48, 143]),
+    // their results away, and waited for them for ever. 218: as 165 of the weather.
+    ("lives", &[17, 48, 143, 218]),
+    // As 305 of the weather.
+    ("devices", &[197]),
 ];
 
 #[test]

@@ -142,9 +142,9 @@ impl Auditor {
         due
     }
 
-    /// Something went wrong between two processes, or with one (then both are the same).
-    pub(super) fn disturbed(&mut self, now: Instant, one: Proc, other: Proc) {
-        self.last_disturbance = Some(now);
+    /// Something goes wrong, until then, between two processes, or with one (then both are the same).
+    pub(super) fn disturbed(&mut self, until: Instant, one: Proc, other: Proc) {
+        self.last_disturbance = self.last_disturbance.max(Some(until));
         *self.disturbances.entry(blame(one, other)).or_default() += 1;
     }
 

@@ -319,7 +319,7 @@ impl World {
         let Some(link) = self.links.get_mut(&id) else { return };
         link.last_arrival = link.last_arrival.map(|last| last.max(until));
         let [dialler, listener] = link.ends();
-        self.audit.disturbed(self.now, dialler, listener);
+        self.audit.disturbed(until, dialler, listener);
     }
 
     /// Nothing gets from one process to another, on any connection.
