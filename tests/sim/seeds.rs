@@ -4,7 +4,7 @@ use tests::sim::{auditor::Checks, scenario::Scenario};
 
 /// Runs these seeds; a failing one is printed with the command that repeats it.
 fn sweep(name: &str, seeds: std::ops::Range<u64>) -> Checks {
-    let scenario = Scenario::named(name).unwrap();
+    let scenario = Scenario::named(name).expect("a scenario of this name");
     let mut sum = Checks::default();
     for seed in seeds {
         let outcome = scenario.run(seed, None);

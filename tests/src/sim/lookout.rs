@@ -155,7 +155,7 @@ impl World {
         }
         let mut idle = 0;
         for (worker, host) in self.workers.iter().enumerate() {
-            if !host.machine().is_some_and(|machine| machine.node().is_some()) || host.leaves() {
+            if host.machine().is_none_or(|machine| machine.node().is_none()) || host.leaves() {
                 continue;
             }
             for (device, _, idle_since) in host.well_devices() {
