@@ -14,7 +14,7 @@ use farm_core::{
 };
 use tests::sim::{
     faults::Fault,
-    hosts::{AppHost, Ending, WorkerHost},
+    hosts::{Ending, WorkerHost},
     work::cost_ns,
     world::{Happening, MILLISECOND, RECOVERY, Setup, World},
 };
