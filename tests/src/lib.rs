@@ -1,5 +1,7 @@
-//! What the multi-process tests share: Gleaner's real binaries as child processes on 127.0.0.1, with ports chosen by the
-//! system, every wait bounded, and nothing left running when a test ends.
+//! What tests share. Here: Gleaner's real binaries as child processes on 127.0.0.1, with ports chosen by the system, every
+//! wait bounded, and nothing left running when a test ends. In [`sim`]: its machines alone, in one process.
+
+pub mod sim;
 
 use std::{
     env,

@@ -36,7 +36,7 @@ use self::{
 };
 use crate::{
     device::DeviceKind,
-    id::{AppId, BatchId, DeviceIndex, Epoch, JobId, JobKey, LinkId, NodeId, StealId},
+    id::{AppId, Attempt, BatchId, DeviceIndex, Epoch, JobId, JobKey, LinkId, NodeId, StealId},
     message::{AppToCoordinator, CoordinatorToApp, CoordinatorToNode, Liveness, NodeToCoordinator},
     time::Instant,
 };
@@ -209,6 +209,22 @@ pub struct AppStatus {
     pub delivered_jobs: u64,
     /// Device time received, nanoseconds.
     pub device_time_ns: u64,
+}
+
+/// Where a job is, as far as a coordinator knows.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Whereabouts {
+    /// Never asked for here, or over.
+    Unknown,
+    /// In line for a place.
+    Waiting,
+    /// Planned, or executed and not yet acknowledged.
+    At {
+        /// The node that answers for it.
+        node: NodeId,
+        /// The attempt there.
+        attempt: Attempt,
+    },
 }
 
 /// The farm as an operator sees it.

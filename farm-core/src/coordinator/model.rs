@@ -101,7 +101,7 @@ pub(super) enum JobState {
     /// Planned; in transit, queued or running.
     Placed(Placement),
     /// Ended on the node's device, its result not yet acknowledged.
-    Executed { node: NodeId, attempt: Attempt },
+    Executed { node: NodeId, device: DeviceIndex, attempt: Attempt },
 }
 
 impl JobState {
@@ -110,7 +110,7 @@ impl JobState {
         match self {
             Self::Waiting => None,
             Self::Placed(place) => Some((place.node, place.attempt)),
-            Self::Executed { node, attempt } => Some((node, attempt)),
+            Self::Executed { node, attempt, .. } => Some((node, attempt)),
         }
     }
 }

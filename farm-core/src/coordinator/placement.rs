@@ -106,7 +106,8 @@ impl CoordinatorMachine {
     /// Says again where the application's jobs are.
     pub(super) fn repeat_placements(&mut self, id: AppId) {
         let Some(app) = self.apps.get(&id) else { return };
-        let placed = |job: &Job| matches!(job.state, JobState::Placed(_));
+        // Executed ones too: an application that lost its memory must know of a result before it comes.
+        let placed = |job: &Job| job.state.holder().is_some();
         let keys: Vec<JobKey> = app.jobs.iter().filter(|(_, job)| placed(job)).map(|(&key, _)| key).collect();
         for chunk in keys.chunks(MAX_REPEATED_JOBS) {
             self.repeat_plan(id, chunk);
@@ -118,9 +119,13 @@ impl CoordinatorMachine {
         let Some(app) = self.apps.get(&id) else { return };
         let mut grouped: BTreeMap<NodeId, BTreeMap<DeviceIndex, Vec<JobAttempt>>> = BTreeMap::new();
         for &key in keys {
-            let Some(JobState::Placed(place)) = app.jobs.get(&key).map(|job| job.state) else { continue };
-            let attempt = JobAttempt { job: key.in_app(id), attempt: place.attempt };
-            grouped.entry(place.node).or_default().entry(place.device).or_default().push(attempt);
+            let (node, device, attempt) = match app.jobs.get(&key).map(|job| job.state) {
+                Some(JobState::Placed(place)) => (place.node, place.device, place.attempt),
+                Some(JobState::Executed { node, device, attempt }) => (node, device, attempt),
+                Some(JobState::Waiting) | None => continue,
+            };
+            let attempt = JobAttempt { job: key.in_app(id), attempt };
+            grouped.entry(node).or_default().entry(device).or_default().push(attempt);
         }
         let nodes: Vec<NodePlan> =
             grouped.into_iter().filter_map(|(node, devices)| self.node_plan(node, devices)).collect();

@@ -197,18 +197,37 @@ impl CoordinatorMachine {
 
     /// An attempt ended with its device or node: a new one follows, unless there were too many.
     pub(super) fn crashed(&mut self, id: JobId, failure: JobFailure, node: NodeId) {
-        let max_crashes = self.config.max_crashes;
-        let Some(job) = self.job_mut(id) else { return };
-        job.crashes = job.crashes.saturating_add(1);
-        if job.crashes >= max_crashes {
-            let reason = format!(
-                "{} attempts ended with their device or node, the last one on {node}: {failure:?}",
-                job.crashes
-            );
-            self.fail_job(id, JobFailure::Poison(reason));
-        } else {
+        if !self.is_poison(id, failure, node) {
             self.requeue(id, Some(node));
         }
+    }
+
+    /// A second attempt failed: the first one goes on, unless that was a crash too many.
+    pub(super) fn backup_failed(&mut self, id: JobId, failure: JobFailure, node: NodeId) {
+        self.drop_backup(id);
+        let first = self.holder(id);
+        if failure != JobFailure::Returned
+            && self.is_poison(id, failure, node)
+            && let Some((node, attempt)) = first
+        {
+            self.tell_node(node, CoordinatorToNode::Cancel { jobs: vec![JobAttempt { job: id, attempt }] });
+        }
+    }
+
+    /// Counts a crash. A job that had too many fails here.
+    fn is_poison(&mut self, id: JobId, failure: JobFailure, node: NodeId) -> bool {
+        let max_crashes = self.config.max_crashes;
+        let Some(job) = self.job_mut(id) else { return false };
+        job.crashes = job.crashes.saturating_add(1);
+        if job.crashes < max_crashes {
+            return false;
+        }
+        let reason = format!(
+            "{} attempts ended with their device or node, the last one on {node}: {failure:?}",
+            job.crashes
+        );
+        self.fail_job(id, JobFailure::Poison(reason));
+        true
     }
 
     /// Takes a job off its place and puts it into line for a new attempt; one that runs elsewhere too just goes on

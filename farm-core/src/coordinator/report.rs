@@ -50,11 +50,10 @@ impl CoordinatorMachine {
             ended;
         let job = JobAttempt { job: id, attempt };
         if self.is_backup(job, node) {
-            if failure.as_ref().is_some_and(JobFailure::can_be_retried) {
-                self.drop_backup(id);
-                return;
+            match failure {
+                Some(failure) if failure.can_be_retried() => return self.backup_failed(id, failure, node),
+                Some(_) | None => self.first_one_loses(id),
             }
-            self.first_one_loses(id);
         }
         // Reports of attempts that were replaced meanwhile change nothing.
         if self.holder(id) != Some((node, attempt)) {
@@ -106,7 +105,7 @@ impl CoordinatorMachine {
     fn device_freed(&mut self, id: NodeId, job: JobAttempt) -> Option<Load> {
         let record = self.job_mut(job.job)?;
         let JobState::Placed(place) = record.state else { return None };
-        record.state = JobState::Executed { node: id, attempt: job.attempt };
+        record.state = JobState::Executed { node: id, device: place.device, attempt: job.attempt };
         let device = self.nodes.get_mut(&id)?.device_mut(place.device)?;
         device.drop_load(place.load);
         Some(place.load)

@@ -98,7 +98,9 @@ impl CoordinatorMachine {
                 app.batches.get(&job.batch).is_some_and(|batch| batch.needs.fulfilled_by(&device.info));
             let reachable =
                 app.link.is_some() && app.unreachable.get(&helper).is_none_or(|until| *until <= now);
-            if !(app.global_stealing && fits && reachable && job.avoid != Some(helper)) {
+            // What crashed once may be poison: one device at a time.
+            let harmless = job.crashes == 0 && job.avoid != Some(helper);
+            if !(app.global_stealing && fits && reachable && harmless) {
                 continue;
             }
             let elapsed_ns = running.for_ns as f64 + now.since(heard).as_nanos() as f64;

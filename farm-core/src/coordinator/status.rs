@@ -1,7 +1,7 @@
 //! The farm as operators see it. It reads, and changes nothing.
 
-use super::{AppStatus, CoordinatorMachine, DeviceStatus, FarmStatus, NodeStatus};
-use crate::id::DeviceIndex;
+use super::{AppStatus, CoordinatorMachine, DeviceStatus, FarmStatus, NodeStatus, Whereabouts};
+use crate::id::{DeviceIndex, JobId};
 
 impl CoordinatorMachine {
     /// The farm as an operator sees it.
@@ -23,6 +23,16 @@ impl CoordinatorMachine {
     #[must_use]
     pub const fn stolen_jobs(&self) -> u64 {
         self.stolen_jobs
+    }
+
+    /// Where a job is, as far as the coordinator knows.
+    #[must_use]
+    pub fn whereabouts(&self, job: JobId) -> Whereabouts {
+        match self.job(job).map(|job| job.state.holder()) {
+            None => Whereabouts::Unknown,
+            Some(None) => Whereabouts::Waiting,
+            Some(Some((node, attempt))) => Whereabouts::At { node, attempt },
+        }
     }
 
     fn node_statuses(&self) -> Vec<NodeStatus> {

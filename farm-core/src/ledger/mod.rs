@@ -19,7 +19,10 @@ use self::{
 };
 use crate::{
     device::Requirements,
-    id::{AppId, BatchId, ContentHash, JobAttempt, JobId, JobIndex, JobKey, NodeId, NodeSession, TaskId},
+    id::{
+        AppId, Attempt, BatchId, ContentHash, JobAttempt, JobId, JobIndex, JobKey, NodeId, NodeSession,
+        TaskId,
+    },
     message::{
         AppHello, AppToCoordinator, AppToNode, Contact, CoordinatorToApp, CostNs, JobFailure, LatencyClass,
         Liveness, NodeToApp, Priority, WaitReason,
@@ -236,6 +239,19 @@ impl Ledger {
         }
     }
 
+    /// A ledger of an application that comes back as another process. `first_batch` is larger than any number that an
+    /// earlier one gave a batch: the application's journal knows it by [`Self::next_batch`].
+    #[must_use]
+    pub fn resumed(hello: AppHello, first_batch: BatchId) -> Self {
+        Self { next_batch: first_batch.0, ..Self::new(hello) }
+    }
+
+    /// The number that the next batch will have.
+    #[must_use]
+    pub const fn next_batch(&self) -> BatchId {
+        BatchId(self.next_batch)
+    }
+
     /// Takes one event in.
     pub fn handle(&mut self, now: Instant, event: Event) {
         if self.session == Session::Finished {
@@ -294,6 +310,13 @@ impl Ledger {
     #[must_use]
     pub fn counts(&self) -> LedgerCounts {
         self.counts
+    }
+
+    /// The jobs that are not over, each with the node that its current plan names and the attempt there.
+    pub fn open_jobs(&self) -> impl Iterator<Item = (TaskId, JobIndex, Option<(NodeId, Attempt)>)> {
+        self.jobs
+            .iter()
+            .map(|(key, job)| (key.task, key.index, job.place.map(|place| (place.life.node, place.attempt))))
     }
 
     fn push(&mut self, effect: Effect) {

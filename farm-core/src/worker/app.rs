@@ -5,7 +5,7 @@ use std::time::Duration;
 use super::{Effect, WorkerMachine};
 use crate::{
     id::{AppId, AppIncarnation, JobAttempt, LinkId},
-    message::{AppToNode, NodeToApp, PROTOCOL_VERSION},
+    message::{AppToNode, JobTicket, NodeToApp, PROTOCOL_VERSION},
     time::Instant,
 };
 
@@ -43,7 +43,12 @@ impl WorkerMachine {
             }
             AppToNode::Jobs(_) | AppToNode::Acks(_) | AppToNode::Cancel(_) => match self.links.get(&link) {
                 Some(&app) => app,
-                None => return self.refuse_app(link, "say hello first".to_owned()),
+                None => {
+                    if let AppToNode::Jobs(tickets) = &message {
+                        self.discard_unheld(tickets);
+                    }
+                    return self.refuse_app(link, "say hello first".to_owned());
+                }
             },
         };
         let own = |job: &JobAttempt| job.job.app == app;
@@ -53,6 +58,7 @@ impl WorkerMachine {
                 if tickets.iter().all(|ticket| own(&ticket.job)) {
                     tickets.into_iter().for_each(|ticket| self.take_in(now, link, ticket));
                 } else {
+                    self.discard_unheld(&tickets);
                     self.app_link_closed(now, link);
                     self.refuse_app(link, format!("jobs of another application than {app}"));
                 }
@@ -64,6 +70,13 @@ impl WorkerMachine {
             }
             AppToNode::Cancel(jobs) => jobs.into_iter().filter(own).for_each(|job| self.cancel(job)),
         }
+    }
+
+    /// The driver has the programs of jobs that are not taken in: it may forget them.
+    fn discard_unheld(&mut self, tickets: &[JobTicket]) {
+        let unheld = |job: &JobAttempt| !self.holds(*job);
+        let unheld: Vec<JobAttempt> = tickets.iter().map(|ticket| ticket.job).filter(unheld).collect();
+        unheld.into_iter().for_each(|job| self.push(Effect::Discard(job)));
     }
 
     pub(super) fn app_link_closed(&mut self, now: Instant, link: LinkId) {

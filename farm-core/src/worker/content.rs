@@ -51,6 +51,11 @@ impl WorkerMachine {
                 Holding { content, state, references: 0, waiting: BTreeSet::new(), failed_tries: 0 }
             });
             holding.references += 1;
+            // Nobody with a link waited for it; this job's application has one.
+            if holding.state == ContentState::Wanted {
+                holding.state = ContentState::Fetching(link);
+                self.effects.push_back(Effect::Fetch { content, link });
+            }
             if holding.state != ContentState::Ready {
                 holding.waiting.insert(job);
                 missing += 1;

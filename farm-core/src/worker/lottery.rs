@@ -28,6 +28,8 @@ pub(super) trait FairShare: fmt::Debug + Send {
     fn draw(&mut self, candidates: &mut dyn Iterator<Item = AppId>, rng: &mut SmallRng) -> Option<AppId>;
     /// One of its jobs took this much, in device seconds x score.
     fn charge(&mut self, app: AppId, cost: f64);
+    /// What it is owed (if positive), in largest charges so far. Zero if it is not here.
+    fn lag(&self, app: AppId) -> f64;
 }
 
 /// Lottery with feedback: `tickets_i = max(p_i + c * lag_i, 0.05 * p_i)`.
@@ -160,6 +162,11 @@ impl FairShare for Lottery {
                 entrant.lag -= cost;
             }
         }
+    }
+
+    fn lag(&self, app: AppId) -> f64 {
+        let unit = if self.largest_charge > 0.0 { self.largest_charge } else { f64::INFINITY };
+        self.entrants.get(&app).map_or(0.0, |entrant| entrant.lag / unit)
     }
 }
 

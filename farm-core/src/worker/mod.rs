@@ -5,7 +5,7 @@
 //!
 //! Split by event family: `session` (coordinator), `app` (applications and their links), `intake` (jobs that arrive or
 //! leave early), `retract` (jobs that another node takes over), `content`, `device` (staging, stealing, completion), `lottery`, `spool` (results until acknowledged),
-//! `report`, `drain`. `job` holds the records they share.
+//! `report`, `drain`, `standing` (what auditors see). `job` holds the records they share.
 
 mod app;
 mod content;
@@ -19,11 +19,13 @@ mod report;
 mod retract;
 mod session;
 mod spool;
+mod standing;
 
 use std::collections::{BTreeMap, VecDeque};
 
 use rand::{SeedableRng, rngs::SmallRng};
 
+pub use self::standing::Standing;
 use self::{
     app::App,
     content::Holding,

@@ -1,0 +1,38 @@
+//! How a node stands, for operators and auditors. It reads, and changes nothing.
+
+use super::WorkerMachine;
+use crate::id::{AppId, JobAttempt};
+
+/// How an application stands with a node's fair share.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Standing {
+    /// Which.
+    pub app: AppId,
+    /// What it is owed (if positive), in largest single charges so far.
+    pub lag: f64,
+    /// It has a job in the queue of every device: only then it is owed its share of all of them.
+    pub backlogged: bool,
+}
+
+impl WorkerMachine {
+    /// The applications with jobs that could be staged, are staged or run.
+    pub fn standings(&self) -> impl Iterator<Item = Standing> {
+        self.apps.iter().filter(|(_, app)| app.active_jobs > 0).map(|(&app, _)| {
+            let mut devices = self.devices.iter().filter(|device| !device.lost);
+            let backlogged = devices.all(|device| device.queues().contains_key(&app));
+            Standing { app, lag: self.share.lag(app), backlogged }
+        })
+    }
+
+    /// Jobs held, executed and unacknowledged ones too.
+    #[must_use]
+    pub fn held_jobs(&self) -> usize {
+        self.jobs.len()
+    }
+
+    /// Whether an attempt is here, in whatever state.
+    #[must_use]
+    pub fn holds(&self, job: JobAttempt) -> bool {
+        self.jobs.get(&job.job).is_some_and(|held| held.attempt == job.attempt)
+    }
+}

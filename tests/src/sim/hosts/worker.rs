@@ -1,0 +1,426 @@
+//! A worker's process and its executors.
+
+use std::{
+    collections::{BTreeMap, BTreeSet, VecDeque},
+    time::Duration,
+};
+
+use farm_core::{
+    device::{DeviceInfo, DeviceKind, Features, Limits},
+    id::{Attempt, ContentHash, DeviceIndex, JobAttempt, JobId, LinkId, NodeSession},
+    message::{AppToNode, Contact, CoordinatorToNode, JobFailure, NodeToApp},
+    time::Instant,
+    worker::{Effect, Event, WorkerConfig, WorkerMachine},
+};
+use rand::Rng;
+
+use crate::sim::{
+    clock::Clock,
+    network::{Message, Proc},
+    work::{cost_ns, digest},
+    world::{Happening, World},
+};
+
+/// A worker's process: gone and started again it has another session and an empty memory.
+#[derive(Debug)]
+pub struct WorkerHost {
+    index: usize,
+    /// What each device's speed is when it is well.
+    speeds: Vec<f64>,
+    /// What each announced score is times the true one.
+    score_errors: Vec<f64>,
+    max_jobs: usize,
+    pub(in crate::sim) life: u32,
+    pub(in crate::sim) session: NodeSession,
+    clock: Clock,
+    machine: Option<WorkerMachine>,
+    pub(in crate::sim) control: Option<LinkId>,
+    leaves: bool,
+    /// Programs by attempt, as they came with the tickets.
+    programs: BTreeSet<JobAttempt>,
+    /// Payloads by attempt: their digests.
+    payloads: BTreeMap<JobAttempt, ContentHash>,
+    cache: BTreeSet<ContentHash>,
+    devices: Vec<Executor>,
+    newest: BTreeMap<JobId, Attempt>,
+    next_run: u64,
+}
+
+/// A device with its running and its staged job.
+#[derive(Debug)]
+struct Executor {
+    lost: bool,
+    /// How many times slower than when it is well.
+    slowness: f64,
+    running: Option<Run>,
+    staged: VecDeque<JobAttempt>,
+    /// Since when it has nothing.
+    idle_since: Option<Instant>,
+}
+
+/// A job on its device.
+#[derive(Clone, Copy, Debug)]
+struct Run {
+    job: JobAttempt,
+    number: u64,
+    started_at: Instant,
+}
+
+impl Executor {
+    const fn new(now: Instant) -> Self {
+        Self { lost: false, slowness: 1.0, running: None, staged: VecDeque::new(), idle_since: Some(now) }
+    }
+
+    fn holds(&self, job: JobAttempt) -> bool {
+        self.running.is_some_and(|run| run.job == job) || self.staged.contains(&job)
+    }
+}
+
+impl WorkerHost {
+    pub(in crate::sim) fn new(index: usize, speeds: &[f64], score_errors: Vec<f64>, max_jobs: usize) -> Self {
+        Self {
+            index,
+            speeds: speeds.to_vec(),
+            score_errors,
+            max_jobs,
+            life: 0,
+            session: NodeSession(0),
+            clock: Clock::TRUE,
+            machine: None,
+            control: None,
+            leaves: false,
+            programs: BTreeSet::new(),
+            payloads: BTreeMap::new(),
+            cache: BTreeSet::new(),
+            devices: Vec::new(),
+            newest: BTreeMap::new(),
+            next_run: 0,
+        }
+    }
+
+    /// A process starts; `seed` is its session and its machine's seed.
+    pub(in crate::sim) fn start(&mut self, now: Instant, seed: u64, clock: Clock) {
+        self.session = NodeSession(seed);
+        self.clock = clock;
+        self.leaves = false;
+        self.devices = self.speeds.iter().map(|_| Executor::new(now)).collect();
+        let devices = self
+            .speeds
+            .iter()
+            .zip(&self.score_errors)
+            .map(|(speed, error)| DeviceInfo {
+                name: format!("sim {speed}"),
+                kind: DeviceKind::Simulated,
+                score: speed * error * 1_000.0,
+                features: Features::default(),
+                limits: Limits::UNBOUNDED,
+            })
+            .collect();
+        self.machine = Some(WorkerMachine::new(WorkerConfig {
+            name: format!("worker-{}", self.index),
+            session: self.session,
+            devices,
+            contact: Contact {
+                addresses: vec![format!("worker-{}", self.index)],
+                certificate_der: Vec::new(),
+            },
+            max_jobs: self.max_jobs,
+            lottery_gain: 0.15,
+            local_stealing: true,
+            seed,
+        }));
+    }
+
+    fn stop(&mut self) {
+        self.life += 1;
+        self.machine = None;
+        self.control = None;
+        self.programs.clear();
+        self.payloads.clear();
+        self.cache.clear();
+        self.devices.clear();
+        self.newest.clear();
+    }
+
+    /// Whether there is a process.
+    #[must_use]
+    pub const fn is_up(&self) -> bool {
+        self.machine.is_some()
+    }
+
+    pub(in crate::sim) fn runs(&self, life: u32) -> bool {
+        self.is_up() && self.life == life
+    }
+
+    pub(in crate::sim) const fn machine(&self) -> Option<&WorkerMachine> {
+        self.machine.as_ref()
+    }
+
+    pub(in crate::sim) fn timeout(&self) -> Option<Instant> {
+        self.machine.as_ref().and_then(WorkerMachine::poll_timeout).map(|due| self.clock.reaches(due))
+    }
+
+    /// Devices that are there and well, with their speeds and since when they have nothing.
+    pub(in crate::sim) fn well_devices(&self) -> impl Iterator<Item = (usize, f64, Option<Instant>)> {
+        self.devices
+            .iter()
+            .zip(&self.speeds)
+            .enumerate()
+            .filter(|(_, (device, _))| !device.lost && device.slowness <= 1.0)
+            .map(|(index, (device, &speed))| (index, speed, device.idle_since))
+    }
+
+    /// Whether every device that is there is well: of a slow one nobody knows how long its queue takes.
+    pub(in crate::sim) fn is_well(&self) -> bool {
+        self.devices.iter().all(|device| device.lost || device.slowness <= 1.0)
+    }
+
+    /// Whether it was asked to end: what it has queued is going away, and it gets nothing new.
+    pub(in crate::sim) const fn leaves(&self) -> bool {
+        self.leaves
+    }
+
+    /// The jobs that it holds and no device has or had.
+    pub(in crate::sim) fn queued(&self) -> impl Iterator<Item = JobAttempt> {
+        self.programs.iter().copied().filter(|job| {
+            !self.payloads.contains_key(job) && !self.devices.iter().any(|device| device.holds(*job))
+        })
+    }
+
+    pub(in crate::sim) fn kept(&self) -> usize {
+        let on_devices = |device: &Executor| usize::from(device.running.is_some()) + device.staged.len();
+        self.programs.len() + self.payloads.len() + self.devices.iter().map(on_devices).sum::<usize>()
+    }
+
+    /// I8: at quiescence nothing is kept.
+    ///
+    /// # Panics
+    /// Something is.
+    pub fn assert_empty(&self) {
+        assert_eq!(self.kept(), 0, "I8: worker {} keeps {:?}", self.index, self.programs.first());
+        let held = self.machine.as_ref().map_or(0, WorkerMachine::held_jobs);
+        assert_eq!(held, 0, "I8: the machine of worker {} keeps jobs", self.index);
+    }
+}
+
+impl World {
+    pub(in crate::sim) fn worker_hears_app(&mut self, index: usize, link: LinkId, message: AppToNode) {
+        if let AppToNode::Jobs(tickets) = &message {
+            self.workers[index].programs.extend(tickets.iter().map(|ticket| ticket.job));
+        }
+        self.worker_event(index, Event::FromApp { link, message });
+    }
+
+    pub(in crate::sim) fn worker_event(&mut self, index: usize, event: Event) {
+        let host = &mut self.workers[index];
+        let Some(machine) = &mut host.machine else { return };
+        host.leaves |=
+            matches!(event, Event::DrainRequested | Event::FromCoordinator(CoordinatorToNode::Drain));
+        machine.handle(host.clock.shows(self.now), event);
+        self.worker_settles(index);
+    }
+
+    pub(in crate::sim) fn worker_timeout(&mut self, index: usize) {
+        let host = &mut self.workers[index];
+        let Some(machine) = &mut host.machine else { return };
+        machine.handle_timeout(host.clock.shows(self.now));
+        self.worker_settles(index);
+    }
+
+    fn worker_settles(&mut self, index: usize) {
+        let due = self.audit.is_due();
+        let Some(machine) = &mut self.workers[index].machine else { return };
+        if due {
+            machine.check_invariants();
+            self.audit.shares(index, machine);
+        }
+        let effects: Vec<Effect> = std::iter::from_fn(|| machine.poll_effect()).collect();
+        for effect in effects {
+            self.log.enter(self.now, Proc::Worker(index), &effect);
+            self.worker_effect(index, effect);
+        }
+        self.rearm(Proc::Worker(index));
+    }
+
+    fn worker_effect(&mut self, index: usize, effect: Effect) {
+        let proc = Proc::Worker(index);
+        match effect {
+            Effect::ToCoordinator(message) => {
+                if let Some(link) = self.workers[index].control {
+                    self.send(proc, link, Message::NodeToCoordinator(message));
+                }
+            }
+            Effect::ToApp { link, message } => {
+                if let NodeToApp::Result(header) = &message
+                    && header.outcome.is_ok()
+                {
+                    let payload = self.workers[index].payloads.get(&header.job);
+                    let job = header.job;
+                    assert_eq!(payload, Some(&header.digest), "I3: {job} is sent without its payload");
+                }
+                self.send(proc, link, Message::NodeToApp(message));
+            }
+            Effect::CloseApp { link } => self.hang_up(proc, link),
+            Effect::Fetch { content, link } => self.fetch(index, content.hash, link),
+            Effect::Execute { job, device } => self.execute(index, job, device),
+            Effect::Abort { job, device } => self.abort(index, job, device),
+            Effect::Discard(job) => {
+                self.workers[index].programs.remove(&job);
+                self.workers[index].payloads.remove(&job);
+            }
+            Effect::Release(content) => {
+                self.workers[index].cache.remove(&content);
+            }
+            Effect::Exit => self.exit_worker(index),
+        }
+    }
+
+    /// The process ends by itself.
+    fn exit_worker(&mut self, index: usize) {
+        // What was said before still arrives; then everybody learns that the process is gone.
+        for link in self.links_of(Proc::Worker(index)) {
+            self.hang_up(Proc::Worker(index), link);
+        }
+        self.workers[index].stop();
+    }
+
+    /// The process is killed.
+    pub(in crate::sim) fn kill_worker(&mut self, index: usize) {
+        if !self.workers[index].is_up() {
+            return;
+        }
+        self.audit.disturbed(self.now, Proc::Worker(index), Proc::Worker(index));
+        for link in self.links_of(Proc::Worker(index)) {
+            self.drop_link(link);
+        }
+        self.workers[index].stop();
+        self.rearm(Proc::Worker(index));
+    }
+
+    /// A killed worker is started again.
+    pub(in crate::sim) fn start_worker(&mut self, index: usize) {
+        if self.workers[index].is_up() {
+            return;
+        }
+        let seed = self.rng.random();
+        let clock = self.new_clock();
+        let host = &mut self.workers[index];
+        host.start(self.now, seed, clock);
+        let life = host.life;
+        self.after(Duration::ZERO, Happening::Dial { proc: Proc::Worker(index), life });
+    }
+
+    fn fetch(&mut self, index: usize, hash: ContentHash, link: LinkId) {
+        let host = &mut self.workers[index];
+        let life = host.life;
+        let fails =
+            self.work.fetch_fails_one_in > 0 && self.rng.random_ratio(1, self.work.fetch_fails_one_in);
+        let cached = host.cache.contains(&hash);
+        let event = if cached || (self.is_open(link) && !fails) {
+            self.workers[index].cache.insert(hash);
+            Event::ContentReady(hash)
+        } else {
+            Event::ContentFailed { content: hash, reason: "simulated".to_owned() }
+        };
+        let delay = Duration::from_micros(if cached { 0 } else { self.rng.random_range(100..20_000) });
+        self.after(delay, Happening::Worker { worker: index, life, event });
+    }
+
+    fn execute(&mut self, index: usize, job: JobAttempt, device: DeviceIndex) {
+        let host = &mut self.workers[index];
+        assert!(host.programs.contains(&job), "{job} is executed without its program");
+        let newest = host.newest.entry(job.job).or_insert(job.attempt);
+        assert!(*newest <= job.attempt, "I4: {job} is executed after {newest}");
+        *newest = job.attempt;
+        let executor = &mut host.devices[usize::from(device.0)];
+        assert!(!executor.lost, "{job} is given to a lost device");
+        assert!(executor.staged.is_empty(), "{device} has a staged job already");
+        executor.staged.push_back(job);
+        self.run_next(index, device);
+    }
+
+    fn run_next(&mut self, index: usize, device: DeviceIndex) {
+        let host = &mut self.workers[index];
+        let executor = &mut host.devices[usize::from(device.0)];
+        if executor.running.is_some() {
+            return;
+        }
+        let Some(job) = executor.staged.pop_front() else {
+            executor.idle_since = Some(self.now);
+            return;
+        };
+        host.next_run += 1;
+        let number = host.next_run;
+        executor.running = Some(Run { job, number, started_at: self.now });
+        executor.idle_since = None;
+        let speed = host.speeds[usize::from(device.0)] / executor.slowness;
+        #[expect(
+            clippy::cast_possible_truncation,
+            clippy::cast_sign_loss,
+            reason = "milliseconds, far from the limits"
+        )]
+        let duration = Duration::from_nanos((cost_ns(job.job.index) as f64 / speed) as u64);
+        let life = host.life;
+        self.audit.begins(index, job.job);
+        let started = Event::Started { job, device };
+        self.after(Duration::ZERO, Happening::Worker { worker: index, life, event: started });
+        self.after(duration, Happening::JobDone { worker: index, life, device, run: number });
+    }
+
+    pub(in crate::sim) fn job_done(&mut self, index: usize, device: DeviceIndex, number: u64) {
+        let host = &mut self.workers[index];
+        let running = &mut host.devices[usize::from(device.0)].running;
+        let Some(run) = running.take_if(|run| run.number == number) else { return };
+        let took = host.clock.shows(self.now).since(host.clock.shows(run.started_at));
+        let job = run.job;
+        let crashes = self.work.crash_one_in > 0 && self.rng.random_ratio(1, self.work.crash_one_in);
+        let outcome = if self.work.poison.contains(&job.job.task) || crashes {
+            self.audit.crashed(job.job, self.setup.max_crashes);
+            Err(JobFailure::Timeout)
+        } else if self.work.invalid.contains(&job.job.task) {
+            Err(JobFailure::InvalidProgram("simulated".to_owned()))
+        } else {
+            self.workers[index].payloads.insert(job, digest(job.job));
+            Ok((vec![4, u64::from(job.job.index.0) * 4], digest(job.job)))
+        };
+        self.run_next(index, device);
+        let device_time_ns = u64::try_from(took.as_nanos()).expect("short");
+        self.worker_event(index, Event::Executed { job, device, device_time_ns, outcome });
+    }
+
+    fn abort(&mut self, index: usize, job: JobAttempt, device: DeviceIndex) {
+        let host = &mut self.workers[index];
+        let executor = &mut host.devices[usize::from(device.0)];
+        executor.staged.retain(|staged| *staged != job);
+        if executor.running.take_if(|run| run.job == job).is_none() {
+            return;
+        }
+        let life = host.life;
+        let event = Event::Executed { job, device, device_time_ns: 0, outcome: Err(JobFailure::Cancelled) };
+        self.after(Duration::from_micros(10), Happening::Worker { worker: index, life, event });
+        self.run_next(index, device);
+    }
+
+    pub(in crate::sim) fn lose_device(&mut self, index: usize, device: DeviceIndex) {
+        let host = &mut self.workers[index];
+        let executor = host.devices.get_mut(usize::from(device.0));
+        let Some(executor) = executor.filter(|executor| !executor.lost) else { return };
+        *executor = Executor { lost: true, ..Executor::new(self.now) };
+        self.audit.disturbed(self.now, Proc::Worker(index), Proc::Worker(index));
+        self.worker_event(index, Event::DeviceLost { device, reason: "simulated".to_owned() });
+    }
+
+    /// A device becomes this many times slower than when it is well: jobs that it begins take as much longer.
+    pub(in crate::sim) fn slow_device(&mut self, index: usize, device: DeviceIndex, slowness: f64) {
+        if let Some(executor) = self.workers[index].devices.get_mut(usize::from(device.0)) {
+            executor.slowness = slowness;
+        }
+    }
+
+    /// Every device that is there is well again.
+    pub(in crate::sim) fn heal_devices(&mut self) {
+        for device in self.workers.iter_mut().flat_map(|host| &mut host.devices) {
+            device.slowness = 1.0;
+        }
+    }
+}
