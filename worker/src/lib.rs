@@ -16,7 +16,7 @@ use farm_core::{
     device::DeviceInfo,
     id::{NodeId, NodeSession},
     message::Contact,
-    worker::WorkerConfig,
+    worker::{Share, WorkerConfig},
 };
 use gpu_exec::{DeviceSpec, ExecutorConfig, OpenError};
 use proto::{
@@ -33,8 +33,6 @@ use self::driver::{Input, QUEUED_INPUTS, Setup};
 
 /// Most jobs a worker holds, executed and unacknowledged ones too; further ones go back to the coordinator.
 const MAX_JOBS: usize = 65_536;
-/// Gain of the lottery's feedback (10-scheduling.md section 2).
-const LOTTERY_GAIN: f64 = 0.15;
 
 /// Settings of a worker.
 #[derive(Clone, Debug)]
@@ -55,6 +53,8 @@ pub struct WorkerOptions {
     pub content_cache_bytes: u64,
     /// How long one job may run.
     pub job_limit: Duration,
+    /// How devices are shared between applications.
+    pub share: Share,
     /// A folder for caches on disk. Checked to be writable; what is cached there comes with a later version.
     pub cache: Option<PathBuf>,
 }
@@ -72,6 +72,7 @@ impl WorkerOptions {
             connect_timeout: Duration::from_secs(10),
             content_cache_bytes: 4 << 30,
             job_limit: Duration::from_secs(600),
+            share: Share::DEFAULT,
             cache: None,
         }
     }
@@ -206,7 +207,7 @@ pub async fn start(options: WorkerOptions) -> Result<WorkerHandle, StartError> {
         contact: Contact { addresses: advertise, certificate_der: server.certificate_der().to_vec() },
         max_jobs: MAX_JOBS,
         local_stealing: true,
-        lottery_gain: LOTTERY_GAIN,
+        share: options.share,
         seed: identity,
     };
     let session = session::first(&options.coordinator, options.connect_timeout)

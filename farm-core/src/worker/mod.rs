@@ -4,7 +4,7 @@
 //! It never sees payloads: its driver keeps programs, contents and results by [`JobAttempt`] and [`ContentHash`].
 //!
 //! Split by event family: `session` (coordinator), `app` (applications and their links), `intake` (jobs that arrive or
-//! leave early), `retract` (jobs that another node takes over), `content`, `device` (staging, stealing, completion), `lottery`, `spool` (results until acknowledged),
+//! leave early), `retract` (jobs that another node takes over), `content`, `device` (completion, loss), `staging` (who is next on which device, stealing between them) with `rate`, `share` (with its rules `lottery` and `stride`), `spool` (results until acknowledged),
 //! `report`, `drain`. `job` holds the records they share.
 
 mod app;
@@ -15,29 +15,36 @@ mod intake;
 mod invariants;
 mod job;
 mod lottery;
+mod rate;
 mod report;
 mod retract;
 mod session;
+mod share;
 mod spool;
+mod staging;
+mod stride;
 
 use std::collections::{BTreeMap, VecDeque};
 
 use rand::{SeedableRng, rngs::SmallRng};
 
+pub use self::share::Share;
 use self::{
     app::App,
     content::Holding,
     device::Device,
     drain::Drain,
     job::{HeldJob, Tombstones},
-    lottery::{FairShare, Lottery},
     report::Reports,
     session::Session,
+    share::{FairShare, Lags},
 };
 use crate::{
     device::DeviceInfo,
     id::{AppId, ContentHash, DeviceIndex, JobAttempt, JobId, LinkId, NodeId, NodeSession},
-    message::{AppToNode, Contact, CoordinatorToNode, JobFailure, NodeToApp, NodeToCoordinator},
+    message::{
+        AppToNode, Contact, CoordinatorToNode, JobFailure, LatencyClass, NodeToApp, NodeToCoordinator,
+    },
     program::Content,
     time::Instant,
 };
@@ -57,8 +64,8 @@ pub struct WorkerConfig {
     pub max_jobs: usize,
     /// Whether an idle device takes jobs of its siblings. On, but where its gain is measured.
     pub local_stealing: bool,
-    /// Gain of the lottery's feedback (10-scheduling.md section 2: c = 0.15).
-    pub lottery_gain: f64,
+    /// How devices are shared between applications.
+    pub share: Share,
     /// Seed of the machine's one generator.
     pub seed: u64,
 }
@@ -95,6 +102,20 @@ pub enum Event {
     },
     /// The staged job began to run.
     Started {
+        /// Which.
+        job: JobAttempt,
+        /// Where.
+        device: DeviceIndex,
+    },
+    /// The running job was interrupted at a launch boundary, for one of a higher class; it keeps its device state.
+    Yielded {
+        /// Which.
+        job: JobAttempt,
+        /// Where.
+        device: DeviceIndex,
+    },
+    /// An interrupted job goes on.
+    Resumed {
         /// Which.
         job: JobAttempt,
         /// Where.
@@ -146,12 +167,15 @@ pub enum Effect {
         /// The connection of the application that has it.
         link: LinkId,
     },
-    /// Hand a job to a device's executor, which holds at most one running and one staged job.
+    /// Hand a job to a device's executor, which holds at most one running and one staged job, and an interactive one
+    /// in addition: that takes the device at the running one's next launch boundary.
     Execute {
         /// Which.
         job: JobAttempt,
         /// Where.
         device: DeviceIndex,
+        /// When it may take the device.
+        class: LatencyClass,
     },
     /// Take a staged or running job back: it need not finish, and `Executed` with `Cancelled` may follow. Its place
     /// counts as free at once, so the next `Execute` may come while the executor still winds the aborted job up.
@@ -188,6 +212,7 @@ pub struct WorkerMachine {
     /// When contents that failed to come are asked for again.
     refetch_at: Option<Instant>,
     devices: Vec<Device>,
+    lags: Lags,
     share: Box<dyn FairShare>,
     rng: SmallRng,
     reports: Reports,
@@ -201,7 +226,7 @@ impl WorkerMachine {
     #[must_use]
     pub fn new(config: WorkerConfig) -> Self {
         let devices = config.devices.iter().cloned().map(Device::new).collect();
-        let share = Box::new(Lottery::new(config.lottery_gain));
+        let share = config.share.rule();
         let rng = SmallRng::seed_from_u64(config.seed);
         Self {
             config,
@@ -217,6 +242,7 @@ impl WorkerMachine {
             contents: BTreeMap::new(),
             refetch_at: None,
             devices,
+            lags: Lags::default(),
             share,
             rng,
             reports: Reports::default(),
@@ -238,7 +264,8 @@ impl WorkerMachine {
             Event::AppLinkClosed { link } => self.app_link_closed(now, link),
             Event::ContentReady(content) => self.content_ready(content),
             Event::ContentFailed { content, reason } => self.content_failed(now, content, &reason),
-            Event::Started { job, device } => self.started(now, job, device),
+            Event::Started { job, device } | Event::Resumed { job, device } => self.started(now, job, device),
+            Event::Yielded { job, device } => self.yielded(now, job, device),
             Event::Executed { job, device, device_time_ns, outcome } => {
                 self.executed(now, job, device, device_time_ns, outcome);
             }
@@ -280,6 +307,13 @@ impl WorkerMachine {
     #[must_use]
     pub const fn node(&self) -> Option<NodeId> {
         self.node
+    }
+
+    /// What each application that has something to run is owed, and the largest job: for audits of fairness (I7). In
+    /// device seconds x score.
+    #[must_use]
+    pub fn lags(&self) -> (Vec<(AppId, f64)>, f64) {
+        (self.lags.awake().collect(), self.lags.largest_charge())
     }
 
     /// What follows from any event: devices get work, reports leave, a drained node goes.

@@ -117,7 +117,7 @@ impl WorkerHost {
             },
             max_jobs: self.max_jobs,
             local_stealing: true,
-            lottery_gain: 0.15,
+            share: worker::Share::DEFAULT,
             seed,
         }));
     }
@@ -295,7 +295,7 @@ impl World {
             }
             WorkerEffect::CloseApp { link } => self.hang_up(proc, link),
             WorkerEffect::Fetch { content, link } => self.fetch(index, content.hash, link),
-            WorkerEffect::Execute { job, device } => self.execute(index, job, device),
+            WorkerEffect::Execute { job, device, .. } => self.execute(index, job, device),
             WorkerEffect::Abort { job, device } => self.abort(index, job, device),
             WorkerEffect::Discard(job) => {
                 self.workers[index].programs.remove(&job);
