@@ -81,8 +81,13 @@ impl Device {
             job: JobId { app: AppId(1), task: TaskId(0), index: JobIndex(0) },
             attempt: Attempt { epoch: Epoch(1), sequence: 1 },
         };
-        let order =
-            Order { job, class: farm_core::message::LatencyClass::Batch, program: Arc::new(program), contents, limit: LIMIT };
+        let order = Order {
+            job,
+            class: farm_core::message::LatencyClass::Batch,
+            program: Arc::new(program),
+            contents,
+            limit: LIMIT,
+        };
         self.executor.submit(order).expect("the device is idle");
         loop {
             match self.inbox.recv_timeout(LIMIT).expect("the executor ends every job within its limit") {
