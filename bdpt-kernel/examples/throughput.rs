@@ -91,7 +91,13 @@ impl Bench {
             job: JobId { app: AppId(1), task: TaskId(0), index: JobIndex(0) },
             attempt: Attempt { epoch: Epoch(1), sequence: self.sequence },
         };
-        let order = Order { job, program: Arc::new(program), contents: self.contents.clone(), limit: LIMIT };
+        let order = Order {
+            job,
+            class: farm_core::message::LatencyClass::Batch,
+            program: Arc::new(program),
+            contents: self.contents.clone(),
+            limit: LIMIT,
+        };
         Ok(self.executor.submit(order)?)
     }
 
@@ -99,7 +105,9 @@ impl Bench {
     fn finish(&self) -> Result<(Duration, Vec<Bytes>), Box<dyn Error>> {
         loop {
             match self.inbox.recv_timeout(LIMIT)? {
-                ExecutorEvent::Started { .. } => {}
+                ExecutorEvent::Started { .. }
+                | ExecutorEvent::Yielded { .. }
+                | ExecutorEvent::Resumed { .. } => {}
                 ExecutorEvent::Finished { outcome, device_time_ns, .. } => {
                     let sections = outcome.map_err(|failure| format!("{failure:?}"))?;
                     return Ok((Duration::from_nanos(device_time_ns), sections));

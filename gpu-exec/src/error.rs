@@ -59,11 +59,11 @@ pub enum OpenError {
     },
 }
 
-/// An executor holds a running and a staged job already, or its device is gone: the order was not taken.
+/// An executor holds as many jobs as it may, or its device is gone: the order was not taken.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Error)]
 pub enum Busy {
-    /// One runs and one is staged. Try again after the next `Finished`.
-    #[error("{job} not taken: the device has a running and a staged job")]
+    /// All places are taken. Try again after the next `Finished`.
+    #[error("{job} not taken: the device holds three jobs")]
     Full {
         /// Which job was refused.
         job: JobAttempt,

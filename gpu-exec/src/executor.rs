@@ -9,7 +9,7 @@ use bytes::Bytes;
 use farm_core::{
     device::DeviceInfo,
     id::{ContentHash, DeviceIndex, JobAttempt},
-    message::JobFailure,
+    message::{JobFailure, LatencyClass},
     program::JobProgram,
 };
 
@@ -31,20 +31,37 @@ pub(crate) const MAX_DEVICES: usize = 256;
 pub struct Order {
     /// Which attempt.
     pub job: JobAttempt,
+    /// Whether it takes the device at the next launch boundary of a running job of a lower class.
+    pub class: LatencyClass,
     /// What to do.
     pub program: Arc<JobProgram>,
     /// The bytes of every module and task allocation that the program names, in any order. A name that is missing
     /// here fails the job with [`JobFailure::ContentUnavailable`], unless the device still holds it.
     pub contents: Vec<(ContentHash, Bytes)>,
-    /// How long the job may run, from `Started`.
+    /// How long the job may run, from `Started`, interruptions not counted.
     pub limit: Duration,
 }
 
-/// What an executor reports. Events of one job come in order: at most one `Started`, then one `Finished`.
+/// Jobs held at once: one runs, one is staged, and a third place for the sake of one that interrupts. Whom it is for
+/// is the scheduler's to say.
+pub(crate) const DEPTH: usize = 3;
+
+/// What an executor reports. Events of one job come in order: at most one `Started`, any number of `Yielded` and `Resumed`
+/// by turns, then one `Finished`.
 #[derive(Clone, Debug, PartialEq)]
 pub enum ExecutorEvent {
     /// The job began to run; the device has room for a staged one.
     Started {
+        /// Which.
+        job: JobAttempt,
+    },
+    /// The running job made way for one of a higher class, at a launch boundary. Its state stays on the device.
+    Yielded {
+        /// Which.
+        job: JobAttempt,
+    },
+    /// A job that had yielded goes on where it was.
+    Resumed {
         /// Which.
         job: JobAttempt,
     },
@@ -142,10 +159,12 @@ impl Executor {
         &self.info
     }
 
-    /// Takes an order: it runs at once, or is staged (prepared while the running one runs).
+    /// Takes an order: it runs at once, or is staged (prepared while the running one runs). One of a higher class than the
+    /// running job takes the device at its next launch boundary; the interrupted job goes on before staged ones of its
+    /// class. At most one is interrupted at a time.
     ///
     /// # Errors
-    /// One runs and one is staged already, or the device is lost. The order is dropped.
+    /// Three are held already, or the device is lost. The order is dropped.
     pub fn submit(&self, order: Order) -> Result<(), Busy> {
         match &self.device {
             Device::Real(device) => device.submit(order),
@@ -153,7 +172,7 @@ impl Executor {
         }
     }
 
-    /// Takes a job back: a staged one ends at once, a running one at its next run boundary, both with
+    /// Takes a job back: a staged or interrupted one ends at once, a running one at its next run boundary, both with
     /// [`JobFailure::Cancelled`]. Unknown jobs are ignored: they have ended already.
     pub fn abort(&self, job: JobAttempt) {
         match &self.device {

@@ -17,13 +17,13 @@ use bytes::Bytes;
 use farm_core::{
     device::{DeviceInfo, DeviceKind, Features, Limits},
     id::JobAttempt,
-    message::{CostNs, JobFailure},
+    message::{CostNs, JobFailure, LatencyClass},
     program::{Buffer, Command, JobProgram, ProgramQuota, validate},
 };
 
 use crate::{
     error::{Busy, OpenError},
-    executor::{EventSink, ExecutorEvent, Order},
+    executor::{DEPTH, EventSink, ExecutorEvent, Order},
     spec::{DeviceSpec, SimSpec},
 };
 
@@ -43,10 +43,13 @@ struct Shared {
 #[derive(Default)]
 struct State {
     running: Option<Running>,
-    staged: Option<Order>,
+    /// Interrupted at a launch boundary.
+    yielded: Option<Running>,
+    /// At most [`DEPTH`] with the two above.
+    staged: VecDeque<Order>,
     /// Tells the running job's alarm from those of jobs that were aborted before.
     generation: u64,
-    /// Events not yet handed out; bounded by two events a held job.
+    /// Events not yet handed out; bounded by two events a held job, and two an interruption.
     outbox: VecDeque<ExecutorEvent>,
     /// Some thread is handing events out: it takes the new ones too, so that their order holds.
     emitting: bool,
@@ -54,9 +57,16 @@ struct State {
 
 struct Running {
     job: JobAttempt,
+    class: LatencyClass,
     program: Arc<JobProgram>,
     sections: Vec<u64>,
-    started: Instant,
+    /// When it began to run, for the first time or again.
+    since: Instant,
+    /// Device time before that.
+    done: Duration,
+    /// Device time at which it next ends or yields.
+    until: Duration,
+    /// Device time of the whole job.
     duration: Duration,
     /// The duration is the order's limit, not the program's cost.
     cut_short: bool,
@@ -81,25 +91,26 @@ impl SimDevice {
 
     pub(crate) fn submit(&self, order: Order) -> Result<(), Busy> {
         let mut state = self.shared.lock();
-        if state.running.is_none() {
-            self.shared.begin(&mut state, order);
-        } else if state.staged.is_none() {
-            state.staged = Some(order);
-        } else {
+        let on_it = usize::from(state.running.is_some()) + usize::from(state.yielded.is_some());
+        if on_it + state.staged.len() >= DEPTH {
             return Err(Busy::Full { job: order.job });
         }
+        state.staged.push_back(order);
+        self.shared.promote(&mut state);
+        self.shared.yield_soon(&mut state);
         self.shared.emit(state);
         Ok(())
     }
 
     pub(crate) fn abort(&self, job: JobAttempt) {
         let mut state = self.shared.lock();
-        if state.staged.as_ref().is_some_and(|order| order.job == job) {
-            state.staged = None;
+        if let Some(position) = state.staged.iter().position(|order| order.job == job) {
+            state.staged.remove(position);
             state.finish(job, 0, Err(JobFailure::Cancelled));
+        } else if let Some(yielded) = state.yielded.take_if(|yielded| yielded.job == job) {
+            state.finish(job, nanoseconds(yielded.done), Err(JobFailure::Cancelled));
         } else if let Some(running) = state.running.take_if(|running| running.job == job) {
-            let elapsed = running.started.elapsed().min(running.duration);
-            state.finish(job, nanoseconds(elapsed), Err(JobFailure::Cancelled));
+            state.finish(job, nanoseconds(running.device_time()), Err(JobFailure::Cancelled));
             self.shared.promote(&mut state);
         }
         self.shared.emit(state);
@@ -125,20 +136,41 @@ impl Shared {
             return;
         }
         if let Some(running) = state.running.take() {
-            state.complete(running);
+            if running.until == running.duration {
+                state.complete(running);
+            } else if state.is_outranked(running.class) {
+                state.outbox.push_back(ExecutorEvent::Yielded { job: running.job });
+                state.yielded = Some(Running { done: running.until, ..running });
+            } else {
+                // The job that it was to make way for has been taken back.
+                let until = running.duration;
+                self.run(&mut state, Running { done: running.until, until, ..running });
+            }
             self.promote(&mut state);
         }
         self.emit(state);
     }
 
+    /// Gives a free device to the next job: the highest class first, one that yielded before staged ones of its class.
     fn promote(self: &Arc<Self>, state: &mut State) {
-        if let Some(order) = state.staged.take() {
-            self.begin(state, order);
+        while state.running.is_none() {
+            let class = state.yielded.as_ref().map(|yielded| yielded.class);
+            if class.is_some_and(|class| !state.is_outranked(class))
+                && let Some(yielded) = state.yielded.take()
+            {
+                state.outbox.push_back(ExecutorEvent::Resumed { job: yielded.job });
+                let until = yielded.duration;
+                self.run(state, Running { until, ..yielded });
+            } else if let Some(order) = state.take_staged() {
+                self.begin(state, order);
+            } else {
+                return;
+            }
         }
     }
 
     fn begin(self: &Arc<Self>, state: &mut State, order: Order) {
-        let Order { job, program, limit, .. } = order;
+        let Order { job, class, program, limit, .. } = order;
         state.outbox.push_back(ExecutorEvent::Started { job });
         let summary = match validate(&program, &ProgramQuota::default()) {
             Ok(summary) => summary,
@@ -148,21 +180,50 @@ impl Shared {
             }
         };
         let cost = duration_of(summary.cost, self.spec.speed);
+        let duration = cost.min(limit);
         let running = Running {
             job,
+            class,
             program,
             sections: summary.sections,
-            started: Instant::now(),
-            duration: cost.min(limit),
+            since: Instant::now(),
+            done: Duration::ZERO,
+            until: duration,
+            duration,
             cut_short: cost > limit,
         };
-        if running.duration.is_zero() {
+        if duration.is_zero() {
             state.complete(running);
+        } else {
+            self.run(state, running);
+        }
+    }
+
+    /// Lets a job run from now on.
+    fn run(self: &Arc<Self>, state: &mut State, running: Running) {
+        let running = Running { since: Instant::now(), ..running };
+        self.wake_for(state, &running);
+        state.running = Some(running);
+        self.yield_soon(state);
+    }
+
+    /// A running job that has to make way does so at its next launch boundary.
+    fn yield_soon(self: &Arc<Self>, state: &mut State) {
+        let Some(running) = &state.running else { return };
+        if state.yielded.is_some() || running.until < running.duration || !state.is_outranked(running.class) {
             return;
         }
-        state.generation += 1;
-        timer::wake_at(running.started + running.duration, Arc::downgrade(self), state.generation);
+        let until = boundary(&running.program, self.spec.speed, running.device_time()).min(running.duration);
+        let Some(running) = state.running.take() else { return };
+        let running = Running { until, ..running };
+        self.wake_for(state, &running);
         state.running = Some(running);
+    }
+
+    fn wake_for(self: &Arc<Self>, state: &mut State, running: &Running) {
+        state.generation += 1;
+        let at = running.since + running.until.saturating_sub(running.done);
+        timer::wake_at(at, Arc::downgrade(self), state.generation);
     }
 
     /// Hands the outbox out, without the lock while a callback runs: it may submit the next job from inside.
@@ -180,7 +241,25 @@ impl Shared {
     }
 }
 
+impl Running {
+    fn device_time(&self) -> Duration {
+        (self.done + self.since.elapsed()).min(self.until)
+    }
+}
+
 impl State {
+    /// Whether an order of a higher class is staged.
+    fn is_outranked(&self, class: LatencyClass) -> bool {
+        self.staged.iter().any(|order| order.class > class)
+    }
+
+    /// The first of the highest class.
+    fn take_staged(&mut self) -> Option<Order> {
+        let class = self.staged.iter().map(|order| order.class).max()?;
+        let first = self.staged.iter().position(|order| order.class == class)?;
+        self.staged.remove(first)
+    }
+
     fn complete(&mut self, running: Running) {
         let outcome = if running.cut_short {
             Err(JobFailure::Timeout)
@@ -193,6 +272,21 @@ impl State {
     fn finish(&mut self, job: JobAttempt, device_time_ns: u64, outcome: Result<Vec<Bytes>, JobFailure>) {
         self.outbox.push_back(ExecutorEvent::Finished { job, device_time_ns, outcome });
     }
+}
+
+/// The end of the launch that runs after so much device time of a program: the next point at which it can be interrupted.
+fn boundary(program: &JobProgram, speed: f64, device_time: Duration) -> Duration {
+    let mut cost = CostNs(0);
+    for command in program.commands() {
+        if let Command::Launch { cost: of_launch, .. } = command {
+            cost.0 = cost.0.saturating_add(of_launch.0);
+            let end = duration_of(cost, speed);
+            if end >= device_time {
+                return end;
+            }
+        }
+    }
+    Duration::MAX
 }
 
 /// How long a launch of `cost` takes at `speed`.

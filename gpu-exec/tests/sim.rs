@@ -11,7 +11,7 @@ use bytes::Bytes;
 use farm_core::{
     device::DeviceKind,
     id::{AppId, Attempt, ContentHash, Epoch, JobAttempt, JobId, JobIndex, TaskId},
-    message::{CostNs, JobFailure},
+    message::{CostNs, JobFailure, LatencyClass},
     program::{Content, JobProgram},
 };
 use gpu_exec::{Busy, DeviceSpec, Executor, ExecutorConfig, ExecutorEvent, Order, open};
@@ -34,7 +34,13 @@ fn costing(cost: CostNs) -> JobProgram {
 }
 
 fn order(index: u32, program: JobProgram) -> Order {
-    Order { job: job(index), program: Arc::new(program), contents: Vec::new(), limit: PATIENCE * 1_000 }
+    Order {
+        job: job(index),
+        class: LatencyClass::Batch,
+        program: Arc::new(program),
+        contents: Vec::new(),
+        limit: PATIENCE * 1_000,
+    }
 }
 
 fn device(spec: &str) -> (Executor, mpsc::Receiver<ExecutorEvent>) {
@@ -79,11 +85,6 @@ fn the_staged_job_starts_when_the_running_one_ends() {
     let (executor, events) = device("sim:speed=2");
     executor.submit(order(1, costing(CostNs(20_000_000)))).unwrap();
     executor.submit(order(2, costing(CostNs(10_000_000)))).unwrap();
-    let third = executor.submit(order(3, costing(CostNs(0))));
-    // The first may have ended already on a machine that was busy for 10 ms; then there is room.
-    if third.is_err() {
-        assert_eq!(third, Err(Busy::Full { job: job(3) }));
-    }
     assert_eq!(next(&events), started(1));
     assert_eq!(next(&events), ended(1, 10_000_000, Ok(Vec::new())));
     assert_eq!(next(&events), started(2));
@@ -91,11 +92,12 @@ fn the_staged_job_starts_when_the_running_one_ends() {
 }
 
 #[test]
-fn one_runs_one_is_staged_and_a_third_is_refused() {
+fn three_are_held_and_a_fourth_is_refused() {
     let (executor, events) = device("sim");
     executor.submit(order(1, costing(LONG))).unwrap();
     executor.submit(order(2, costing(CostNs(0)))).unwrap();
-    assert_eq!(executor.submit(order(3, costing(CostNs(0)))), Err(Busy::Full { job: job(3) }));
+    executor.submit(order(3, costing(CostNs(0)))).unwrap();
+    assert_eq!(executor.submit(order(6, costing(CostNs(0)))), Err(Busy::Full { job: job(6) }));
     executor.abort(job(9));
     executor.abort(job(1));
     assert_eq!(next(&events), started(1));
@@ -103,6 +105,8 @@ fn one_runs_one_is_staged_and_a_third_is_refused() {
     assert_eq!((ended_job, outcome), (job(1), Err(JobFailure::Cancelled)));
     assert_eq!(next(&events), started(2));
     assert_eq!(next(&events), ended(2, 0, Ok(Vec::new())));
+    assert_eq!(next(&events), started(3));
+    assert_eq!(next(&events), ended(3, 0, Ok(Vec::new())));
     executor.submit(order(4, costing(LONG))).unwrap();
     executor.submit(order(5, costing(LONG))).unwrap();
     executor.abort(job(5));
@@ -194,4 +198,98 @@ fn many_devices_share_one_timer() {
         }
     }
     assert_eq!(ends, vec![1; 32]);
+}
+
+fn interactive(index: u32, cost: CostNs) -> Order {
+    Order { class: LatencyClass::Interactive, ..order(index, costing(cost)) }
+}
+
+fn yielded(index: u32) -> ExecutorEvent {
+    ExecutorEvent::Yielded { job: job(index) }
+}
+
+fn resumed(index: u32) -> ExecutorEvent {
+    ExecutorEvent::Resumed { job: job(index) }
+}
+
+/// A job of many launches of a millisecond, whose result holds what it was given.
+fn many_launches(launches: u32) -> JobProgram {
+    let mut program = JobProgram::default();
+    let kernel = program.function(Content { hash: ContentHash([1; 32]), size_bytes: 1 }, "main");
+    let buffer = program.malloc(4).unwrap();
+    program.memcpy_htod_buffer(buffer, 0, &[1, 2, 3, 4]).unwrap();
+    for _ in 0..launches {
+        program.launch_with_cost(kernel, [1, 1, 1], CostNs(1_000_000)).unwrap();
+    }
+    program.memcpy_dtoh(buffer, 0, 4).unwrap();
+    program
+}
+
+#[test]
+fn an_interactive_job_interrupts_a_batch_job_which_then_goes_on() {
+    let (executor, events) = device("sim");
+    executor.submit(order(1, many_launches(300))).unwrap();
+    executor.submit(order(2, costing(CostNs(0)))).unwrap();
+    assert_eq!(next(&events), started(1));
+    executor.submit(interactive(3, CostNs(1_000_000))).unwrap();
+    assert_eq!(next(&events), yielded(1));
+    assert_eq!(next(&events), started(3));
+    assert_eq!(next(&events), ended(3, 1_000_000, Ok(Vec::new())));
+    assert_eq!(next(&events), resumed(1), "before the job that is staged");
+    let whole = ended(1, 300_000_000, Ok(vec![Bytes::from_static(&[1, 2, 3, 4])]));
+    assert_eq!(next(&events), whole, "its own time, without the interruption's");
+    assert_eq!(next(&events), started(2));
+    assert_eq!(next(&events), ended(2, 0, Ok(Vec::new())));
+    assert!(events.try_recv().is_err(), "each ended once");
+}
+
+#[test]
+fn a_job_without_launch_boundary_runs_to_its_end() {
+    let (executor, events) = device("sim");
+    executor.submit(order(1, many_launches(1))).unwrap();
+    executor.submit(interactive(2, CostNs(0))).unwrap();
+    assert_eq!(next(&events), started(1));
+    assert!(matches!(next(&events), ExecutorEvent::Finished { .. }), "its only launch cannot be interrupted");
+    assert_eq!(next(&events), started(2));
+}
+
+#[test]
+fn one_job_is_interrupted_at_a_time_and_never_by_its_own_class() {
+    let (executor, events) = device("sim");
+    executor.submit(order(1, many_launches(300))).unwrap();
+    executor.submit(interactive(2, LONG)).unwrap();
+    assert_eq!([next(&events), next(&events), next(&events)], [started(1), yielded(1), started(2)]);
+    executor.submit(interactive(3, CostNs(0))).unwrap();
+    executor.abort(job(2));
+    let ExecutorEvent::Finished { job: ended_job, .. } = next(&events) else { panic!("no end") };
+    assert_eq!(ended_job, job(2), "and no interruption before it");
+    assert_eq!([next(&events), next(&events)], [started(3), ended(3, 0, Ok(Vec::new()))]);
+    assert_eq!(next(&events), resumed(1));
+}
+
+#[test]
+fn an_interrupted_job_can_be_taken_back() {
+    let (executor, events) = device("sim");
+    executor.submit(order(1, many_launches(300))).unwrap();
+    executor.submit(interactive(2, LONG)).unwrap();
+    assert_eq!([next(&events), next(&events), next(&events)], [started(1), yielded(1), started(2)]);
+    executor.abort(job(1));
+    let ExecutorEvent::Finished { job: ended_job, device_time_ns, outcome } = next(&events) else {
+        panic!("no end")
+    };
+    assert_eq!((ended_job, outcome), (job(1), Err(JobFailure::Cancelled)));
+    assert!(device_time_ns > 0 && device_time_ns % 1_000_000 == 0, "whole launches: {device_time_ns}");
+    executor.abort(job(2));
+    assert!(matches!(next(&events), ExecutorEvent::Finished { .. }), "the device is free then");
+}
+
+#[test]
+fn the_limit_of_an_interrupted_job_does_not_run_on() {
+    let (executor, events) = device("sim");
+    let limit = Duration::from_millis(40);
+    executor.submit(Order { limit, ..order(1, many_launches(300)) }).unwrap();
+    executor.submit(interactive(2, CostNs(60_000_000))).unwrap();
+    assert_eq!([next(&events), next(&events), next(&events)], [started(1), yielded(1), started(2)]);
+    assert_eq!([next(&events), next(&events)], [ended(2, 60_000_000, Ok(Vec::new())), resumed(1)]);
+    assert_eq!(next(&events), ended(1, 40_000_000, Err(JobFailure::Timeout)), "forty of its own");
 }

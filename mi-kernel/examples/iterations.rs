@@ -95,11 +95,19 @@ impl Bench {
             job: JobId { app: AppId(1), task: TaskId(0), index: JobIndex(0) },
             attempt: Attempt { epoch: Epoch(1), sequence: self.sequence },
         };
-        let order = Order { job, program: Arc::new(program), contents: contents.to_vec(), limit: LIMIT };
+        let order = Order {
+            job,
+            class: farm_core::message::LatencyClass::Batch,
+            program: Arc::new(program),
+            contents: contents.to_vec(),
+            limit: LIMIT,
+        };
         self.executor.submit(order)?;
         loop {
             match self.inbox.recv_timeout(LIMIT)? {
-                ExecutorEvent::Started { .. } => {}
+                ExecutorEvent::Started { .. }
+                | ExecutorEvent::Yielded { .. }
+                | ExecutorEvent::Resumed { .. } => {}
                 ExecutorEvent::Finished { outcome, device_time_ns, .. } => {
                     let sections = outcome.map_err(|failure| format!("{failure:?}"))?;
                     return Ok((Duration::from_nanos(device_time_ns), sections));

@@ -10,8 +10,8 @@ use farm_core::{
 };
 use gpu_exec::{Executor, ExecutorEvent, Order};
 
-/// An executor's jobs: one running, one staged.
-const EXECUTOR_DEPTH: usize = 2;
+/// An executor's jobs: one running, one staged, one that interrupts or is interrupted.
+const EXECUTOR_DEPTH: usize = 3;
 
 /// What an executor says.
 #[derive(Debug)]
@@ -23,6 +23,8 @@ pub(crate) struct DeviceEvent {
 #[derive(Debug)]
 pub(crate) enum DeviceNews {
     Started(JobAttempt),
+    Yielded(JobAttempt),
+    Resumed(JobAttempt),
     Finished { job: JobAttempt, device_time_ns: u64, outcome: Result<Payload, JobFailure> },
     Lost(String),
 }
@@ -39,6 +41,8 @@ impl DeviceEvent {
     pub(crate) fn of(device: DeviceIndex, event: ExecutorEvent) -> Self {
         let what = match event {
             ExecutorEvent::Started { job } => DeviceNews::Started(job),
+            ExecutorEvent::Yielded { job } => DeviceNews::Yielded(job),
+            ExecutorEvent::Resumed { job } => DeviceNews::Resumed(job),
             ExecutorEvent::Finished { job, device_time_ns, outcome } => {
                 DeviceNews::Finished { job, device_time_ns, outcome: outcome.map(Payload::of) }
             }

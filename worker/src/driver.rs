@@ -10,7 +10,7 @@ use std::{
 use bytes::Bytes;
 use farm_core::{
     id::{ContentHash, DeviceIndex, JobAttempt, LinkId, NodeId},
-    message::{AppToNode, CoordinatorToNode, JobFailure, NodeToApp, NodeToCoordinator},
+    message::{AppToNode, CoordinatorToNode, JobFailure, LatencyClass, NodeToApp, NodeToCoordinator},
     program::{Command, Content, JobProgram},
     time,
     worker::{Effect, Event, WorkerConfig, WorkerMachine},
@@ -70,7 +70,7 @@ pub(crate) struct Setup {
     pub(crate) options: WorkerOptions,
     pub(crate) config: WorkerConfig,
     pub(crate) devices: Vec<Executor>,
-    /// Unbounded for its senders, who must not wait; a device has at most three jobs and two events of each.
+    /// Unbounded for its senders, who must not wait; a device has at most six jobs, two events of each, and two an interruption.
     pub(crate) events: mpsc::UnboundedReceiver<DeviceEvent>,
     pub(crate) server: Arc<DataServer>,
     pub(crate) session: NodeLink,
@@ -284,6 +284,8 @@ impl Driver {
     fn heard(&mut self, DeviceEvent { device, what }: DeviceEvent) {
         match what {
             DeviceNews::Started(job) => self.tell(Event::Started { job, device }),
+            DeviceNews::Yielded(job) => self.tell(Event::Yielded { job, device }),
+            DeviceNews::Resumed(job) => self.tell(Event::Resumed { job, device }),
             DeviceNews::Finished { job, device_time_ns, outcome } => {
                 if let Some(device) = self.devices.get_mut(usize::from(device.0)) {
                     device.finished();
@@ -346,7 +348,7 @@ impl Driver {
                 }
             }
             Effect::Fetch { content, link } => self.fetch(content, link),
-            Effect::Execute { job, device } => self.execute(job, device),
+            Effect::Execute { job, device, class } => self.execute(job, device, class),
             Effect::Abort { job, device } => {
                 if let Some(device) = self.devices.get_mut(usize::from(device.0)) {
                     device.abort(job);
@@ -417,7 +419,7 @@ impl Driver {
         }
     }
 
-    fn execute(&mut self, job: JobAttempt, index: DeviceIndex) {
+    fn execute(&mut self, job: JobAttempt, index: DeviceIndex, class: LatencyClass) {
         let program = match self.payloads.program(job) {
             Some(bytes) => codec::decode_program(&bytes).map_err(|error| error.to_string()),
             None => Err("the node has no program of this job".to_owned()),
@@ -429,7 +431,7 @@ impl Driver {
                     .filter_map(|hash| Some((hash, self.contents.get(&hash)?)))
                     .collect();
                 let (program, limit) = (Arc::new(program), self.options.job_limit);
-                device.execute(Order { job, program, contents, limit });
+                device.execute(Order { job, class, program, contents, limit });
             }
             (program, _) => {
                 let reason = program.err().unwrap_or_else(|| format!("{index} does not exist"));

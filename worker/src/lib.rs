@@ -16,7 +16,7 @@ use farm_core::{
     device::DeviceInfo,
     id::{NodeId, NodeSession},
     message::Contact,
-    worker::WorkerConfig,
+    worker::{Share, WorkerConfig},
 };
 use gpu_exec::{DeviceSpec, ExecutorConfig, OpenError};
 use proto::{
@@ -33,8 +33,6 @@ use self::driver::{Input, QUEUED_INPUTS, Setup};
 
 /// Most jobs a worker holds, executed and unacknowledged ones too; further ones go back to the coordinator.
 const MAX_JOBS: usize = 65_536;
-/// Gain of the lottery's feedback (10-scheduling.md section 2).
-const LOTTERY_GAIN: f64 = 0.15;
 
 /// Settings of a worker.
 #[derive(Clone, Debug)]
@@ -57,6 +55,8 @@ pub struct WorkerOptions {
     pub job_limit: Duration,
     /// Whether an idle device takes queued jobs of its siblings; off only for measuring what that gains.
     pub local_stealing: bool,
+    /// How devices are shared between applications.
+    pub share: Share,
     /// A folder for caches on disk. Checked to be writable; what is cached there comes with a later version.
     pub cache: Option<PathBuf>,
 }
@@ -75,6 +75,7 @@ impl WorkerOptions {
             content_cache_bytes: 4 << 30,
             job_limit: Duration::from_secs(600),
             local_stealing: true,
+            share: Share::DEFAULT,
             cache: None,
         }
     }
@@ -209,7 +210,7 @@ pub async fn start(options: WorkerOptions) -> Result<WorkerHandle, StartError> {
         contact: Contact { addresses: advertise, certificate_der: server.certificate_der().to_vec() },
         max_jobs: MAX_JOBS,
         local_stealing: options.local_stealing,
-        lottery_gain: LOTTERY_GAIN,
+        share: options.share,
         seed: identity,
     };
     let session = session::first(&options.coordinator, options.connect_timeout)

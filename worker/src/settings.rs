@@ -9,6 +9,7 @@ use std::{
 
 use anyhow::{Context as _, bail, ensure};
 use clap::Parser;
+use farm_core::worker::Share;
 use gpu_exec::DeviceSpec;
 use serde::Deserialize;
 use worker::WorkerOptions;
@@ -86,8 +87,20 @@ struct ConfigFile {
     job_limit: Option<String>,
     /// Most bytes of task allocations and modules kept in memory.
     content_cache_bytes: Option<u64>,
+    /// How devices are shared between applications.
+    #[serde(default)]
+    share: Rule,
     #[serde(default)]
     scheduler: SchedulerSection,
+}
+
+/// The `share` of the config file.
+#[derive(Clone, Copy, Debug, Default, Deserialize)]
+#[serde(rename_all = "lowercase")]
+enum Rule {
+    #[default]
+    Lottery,
+    Stride,
 }
 
 /// What only who measures the scheduler changes.
@@ -145,6 +158,10 @@ pub(crate) fn options(arguments: Arguments) -> anyhow::Result<WorkerOptions> {
         content_cache_bytes: file.content_cache_bytes.unwrap_or(defaults.content_cache_bytes),
         job_limit: duration("job_limit", file.job_limit, defaults.job_limit)?,
         local_stealing: file.scheduler.local_stealing == Switch::On,
+        share: match file.share {
+            Rule::Lottery => Share::DEFAULT,
+            Rule::Stride => Share::Stride,
+        },
         cache: arguments.cache.or(file.cache),
         ..defaults
     })
@@ -257,7 +274,7 @@ mod tests {
     fn flags_overrule_the_file() {
         let config = "coordinator = 'a:1'\nlisten = '127.0.0.1:5'\nadvertise = ['b:2']\nname = 'n'\n\
                       device = ['cpu', 'gpu:1']\ncache = '/c'\nconnect_timeout = '5m'\njob_limit = '250ms'\n\
-                      content_cache_bytes = 77\n";
+                      content_cache_bytes = 77\nshare = 'stride'\n";
         let from_file = parse(&[], Some(config)).unwrap();
         assert_eq!((from_file.coordinator.as_str(), from_file.name.as_str()), ("a:1", "n"));
         assert_eq!(from_file.listen.to_string(), "127.0.0.1:5");
@@ -268,6 +285,7 @@ mod tests {
         assert_eq!(from_file.job_limit, Duration::from_millis(250));
         assert_eq!(from_file.content_cache_bytes, 77);
         assert!(from_file.local_stealing, "on unless it is switched off");
+        assert_eq!(from_file.share, Share::Stride);
 
         let sim = "sim:score=2,speed=3";
         let flags =
@@ -293,7 +311,7 @@ mod tests {
     fn errors_name_the_place() {
         let long_name = "n".repeat(MAX_NAME_BYTES + 1);
         let with = |flags: &[&'static str]| [COORDINATOR.as_slice(), flags].concat();
-        let cases: [(Vec<&str>, Option<&str>, &[&str]); 14] = [
+        let cases: [(Vec<&str>, Option<&str>, &[&str]); 15] = [
             (vec![], None, &["--coordinator", "GLEANER_COORDINATOR"]),
             (vec!["--coordinator", "host"], None, &["coordinator", "\"host\"", "HOST:PORT"]),
             (vec!["--coordinator", "host:0"], None, &["\"host:0\""]),
@@ -303,6 +321,7 @@ mod tests {
                 Some("coordinator = 'a:1'\ncoordinater = 'a:1'\n"),
                 &["config file", "line 2", "coordinater"],
             ),
+            (vec![], Some("share = 'fair'\n"), &["config file", "line 1", "lottery", "stride"]),
             (vec![], Some("device = 'cpu'\n"), &["config file", "line 1"]),
             (with(&["--config", "/no/such/file.toml"]), None, &["/no/such/file.toml"]),
             (with(&["--listen", "7800"]), None, &["listen", "\"7800\""]),

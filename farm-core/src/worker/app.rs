@@ -94,7 +94,7 @@ impl WorkerMachine {
         let app = self.apps.entry(id).or_default();
         app.announced = true;
         app.drop_at = None;
-        self.share.join(id, weight);
+        self.lags.join(id, weight);
     }
 
     /// Everything of the application is dropped, whatever state it is in.
@@ -108,7 +108,7 @@ impl WorkerMachine {
             self.push(Effect::CloseApp { link });
         }
         if self.apps.remove(&id).is_some() {
-            self.share.leave(id);
+            self.lags.leave(id);
         }
     }
 
@@ -151,7 +151,7 @@ impl WorkerMachine {
         app.incarnation = Some(incarnation);
         if !known {
             app.drop_at = registered.then(|| now.after(Duration::from_millis(UNANNOUNCED_MS)));
-            self.share.join(id, UNANNOUNCED_WEIGHT);
+            self.lags.join(id, UNANNOUNCED_WEIGHT);
         }
         // The newest link is the one that stands: an older one is half-open, or about to be.
         if let Some(old) = app.link.replace(link)
@@ -207,7 +207,7 @@ impl WorkerMachine {
             self.apps.get(&id).is_some_and(|app| !app.announced && app.link.is_none() && app.held_jobs == 0);
         if idle {
             self.apps.remove(&id);
-            self.share.leave(id);
+            self.lags.leave(id);
         }
     }
 }

@@ -1,11 +1,11 @@
-//! Devices: their queues, one running and one staged job each, local stealing (10-scheduling.md sections 2 and 3),
-//! completion and loss.
+//! Devices: their queues, what their executors hold, what they are worth, completion and loss.
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
 use super::{
     Effect, WorkerMachine,
-    job::{Handed, HeldState, Rank, Spooled},
+    job::{Handed, HeldState, Phase, Rank, Spooled},
+    rate::Rate,
 };
 use crate::{
     device::DeviceInfo,
@@ -14,37 +14,39 @@ use crate::{
     time::Instant,
 };
 
-/// One running, one staged: more would move the lottery's decision further away from the moment it counts.
-const MAX_HANDED_OVER: usize = 2;
-
 /// What a job of unknown cost adds to a queue, in nanoseconds.
 const UNKNOWN_COST_NS: u64 = 1_000_000;
+
+/// What a job without measurable device time is charged for, in nanoseconds: it took a place all the same.
+const LEAST_CHARGE_NS: u64 = 1_000;
 
 const NANOSECONDS_PER_SECOND: f64 = 1e9;
 
 /// A device of this node.
 #[derive(Debug)]
 pub(super) struct Device {
-    info: DeviceInfo,
+    pub(super) info: DeviceInfo,
     pub(super) lost: bool,
     /// Jobs that could be staged, by application. No queue is empty.
     queues: BTreeMap<AppId, BTreeSet<Rank>>,
     pub(super) queued_jobs: usize,
     queued_ns: u128,
+    pub(super) rate: Rate,
     /// Jobs planned here that wait for contents.
     pub(super) waiting_jobs: usize,
-    /// With the executor: the first one runs or is about to, the second one is staged.
+    /// With the executor: the first one runs or is about to; behind it are those that are staged or interrupted.
     pub(super) handed_over: VecDeque<JobId>,
 }
 
 impl Device {
-    pub(super) const fn new(info: DeviceInfo) -> Self {
+    pub(super) fn new(info: DeviceInfo) -> Self {
         Self {
             info,
             lost: false,
             queues: BTreeMap::new(),
             queued_jobs: 0,
             queued_ns: 0,
+            rate: Rate::default(),
             waiting_jobs: 0,
             handed_over: VecDeque::new(),
         }
@@ -78,50 +80,71 @@ impl Device {
 
     /// Whether a job planned for `other` may run here: the same kind, and nothing that `other` has is lacking. What the
     /// job itself needs is not on its ticket.
-    fn stands_in_for(&self, other: &Self) -> bool {
+    pub(super) fn stands_in_for(&self, other: &Self) -> bool {
         !self.lost
             && self.info.kind == other.info.kind
             && self.info.features.contains(other.info.features)
             && self.info.limits.cover(&other.info.limits)
     }
 
-    /// How long the queue takes, up to a common factor.
-    fn backlog(&self) -> f64 {
-        self.queued_ns as f64 / self.info.score
+    /// Work in the queue, in nanoseconds at speed 1.0.
+    pub(super) const fn queued_ns(&self) -> u128 {
+        self.queued_ns
     }
 }
 
 impl WorkerMachine {
-    /// Hands jobs to executors until every device has a running and a staged one, or nothing is left.
-    pub(super) fn fill_devices(&mut self, now: Instant) {
-        if self.devices.iter().all(|device| device.queued_jobs == 0) {
+    /// The executor says that a job runs: for the first time, or again.
+    pub(super) fn started(&mut self, now: Instant, job: JobAttempt, device: DeviceIndex) {
+        if self.handed(job, device).is_none() {
             return;
         }
-        for index in self.device_indices() {
-            while self.has_room(index) && self.hand_over(now, index, index) {}
-        }
-        if !self.config.local_stealing {
-            return;
-        }
-        // An idle device steals whatever is queued; a busy one only what its owner would not start next.
-        for (handed_over, left) in [(0, 1), (1, 2)] {
-            for index in self.device_indices() {
-                if self.device_mut(index).handed_over.len() == handed_over {
-                    self.steal(now, index, left);
-                }
+        // One runs at a time: what ran before has been interrupted.
+        for other in self.device_mut(device).handed_over.clone() {
+            if let Some(handed) = self.handed_mut(other)
+                && other != job.job
+            {
+                handed.pause(now);
             }
+        }
+        if let Some(handed) = self.handed_mut(job.job) {
+            handed.run(now);
+        }
+        let handed_over = &mut self.device_mut(device).handed_over;
+        if let Some(position) = handed_over.iter().position(|other| *other == job.job)
+            && let Some(first) = handed_over.remove(position)
+        {
+            handed_over.push_front(first);
         }
     }
 
-    pub(super) fn started(&mut self, now: Instant, job: JobAttempt, device: DeviceIndex) {
-        let held =
-            self.jobs.get_mut(&job.job).filter(|held| (held.attempt, held.device) == (job.attempt, device));
-        let Some(HeldState::HandedOver(handed)) = held.map(|held| &mut held.state) else { return };
-        handed.started_at = Some(now);
-        let handed_over = &mut self.device_mut(device).handed_over;
-        // The executor says which one runs: it goes to the front.
-        if let Some(position) = handed_over.iter().position(|other| *other == job.job) {
-            handed_over.swap(0, position);
+    /// The executor says that a job was interrupted at a launch boundary; its state is still on the device.
+    pub(super) fn yielded(&mut self, now: Instant, job: JobAttempt, device: DeviceIndex) {
+        if self.handed(job, device).is_some()
+            && let Some(handed) = self.handed_mut(job.job)
+        {
+            handed.pause(now);
+        }
+    }
+
+    /// How a job is with the executor of `device`, if it is.
+    fn handed(&self, job: JobAttempt, device: DeviceIndex) -> Option<Handed> {
+        let held = self.jobs.get(&job.job)?;
+        match held.state {
+            HeldState::HandedOver(handed) if (held.attempt, held.device) == (job.attempt, device) => {
+                Some(handed)
+            }
+            HeldState::HandedOver(_)
+            | HeldState::Fetching { .. }
+            | HeldState::Queued
+            | HeldState::Executed(_) => None,
+        }
+    }
+
+    fn handed_mut(&mut self, job: JobId) -> Option<&mut Handed> {
+        match self.jobs.get_mut(&job).map(|held| &mut held.state) {
+            Some(HeldState::HandedOver(handed)) => Some(handed),
+            Some(HeldState::Fetching { .. } | HeldState::Queued | HeldState::Executed(_)) | None => None,
         }
     }
 
@@ -133,19 +156,22 @@ impl WorkerMachine {
         device_time_ns: u64,
         outcome: Result<(Vec<u64>, ContentHash), JobFailure>,
     ) {
-        let current =
-            self.jobs.get(&job.job).filter(|held| held.attempt == job.attempt && held.device == device);
-        let Some(HeldState::HandedOver(handed)) = current.map(|held| &held.state) else {
+        let Some(handed) = self.handed(job, device) else {
             // Aborted, replaced, or lost with its device: nobody waits for this payload. A spooled result of the same
             // attempt is another matter, and stays.
             if self.jobs.get(&job.job).is_none_or(|held| held.attempt != job.attempt) {
                 self.push(Effect::Discard(job));
+                // It took the device as long as it ran.
+                self.charge(job.job.app, device, device_time_ns);
             }
             return;
         };
         let trace = handed.trace(now);
-        let cost = device_time_ns as f64 / NANOSECONDS_PER_SECOND * self.device_mut(device).info.score;
-        self.share.charge(job.job.app, cost);
+        self.charge(job.job.app, device, device_time_ns.max(LEAST_CHARGE_NS));
+        if outcome.is_ok() {
+            let cost = self.jobs.get(&job.job).map_or(CostNs(0), |held| held.cost);
+            self.device_mut(device).rate.observe(cost, device_time_ns);
+        }
         match outcome {
             Err(failure) if failure.can_be_retried() => {
                 self.remove(job);
@@ -165,6 +191,11 @@ impl WorkerMachine {
         }
     }
 
+    fn charge(&mut self, app: AppId, device: DeviceIndex, device_time_ns: u64) {
+        let Some(device) = self.devices.get(usize::from(device.0)) else { return };
+        self.lags.charge(app, device_time_ns as f64 / NANOSECONDS_PER_SECOND * device.info.score);
+    }
+
     pub(super) fn device_lost(&mut self, now: Instant, index: DeviceIndex, reason: &str) {
         let Some(device) = self.devices.get_mut(usize::from(index.0)).filter(|device| !device.lost) else {
             return;
@@ -178,15 +209,16 @@ impl WorkerMachine {
         for (&job, held) in self.jobs.iter().filter(|(_, held)| held.device == index) {
             let job = JobAttempt { job, attempt: held.attempt };
             match held.state {
-                HeldState::HandedOver(_) => on_it.push(job),
+                HeldState::HandedOver(handed) => on_it.push((job, handed.trace(now))),
                 HeldState::Fetching { .. } | HeldState::Queued => queued.push((held.arrival, job)),
                 HeldState::Executed(_) => {}
             }
         }
-        for job in on_it {
+        for (job, trace) in on_it {
             self.remove(job);
             self.push(Effect::Discard(job));
-            self.report_failure(now, job, index, JobFailure::DeviceLost(reason.to_owned()));
+            let failure = Some(JobFailure::DeviceLost(reason.to_owned()));
+            self.reports.executed(now, Executed { job, device: index, device_time_ns: 0, trace, failure });
         }
         queued.sort_unstable();
         for (_, job) in queued {
@@ -202,10 +234,9 @@ impl WorkerMachine {
     fn load(&self, now: Instant, device: &Device) -> DeviceLoad {
         let running = device.handed_over.front().and_then(|&id| {
             let held = self.jobs.get(&id)?;
-            let HeldState::HandedOver(Handed { started_at: Some(started_at), .. }) = held.state else {
-                return None;
-            };
-            let for_ns = u64::try_from(now.since(started_at).as_nanos()).unwrap_or(u64::MAX);
+            let HeldState::HandedOver(handed) = held.state else { return None };
+            let Phase::Running { .. } = handed.phase else { return None };
+            let for_ns = u64::try_from(handed.ran(now).as_nanos()).unwrap_or(u64::MAX);
             Some(RunningJob { job: JobAttempt { job: id, attempt: held.attempt }, for_ns })
         });
         let held = device.queued_jobs + device.waiting_jobs + device.handed_over.len();
@@ -224,7 +255,8 @@ impl WorkerMachine {
             return Some(index);
         }
         let siblings = (0_u16..).zip(&self.devices).filter(|(_, device)| device.stands_in_for(planned));
-        let shortest = siblings.min_by(|(_, one), (_, other)| one.backlog().total_cmp(&other.backlog()));
+        let backlog = |device: &Device| device.queued_ns as f64 / self.speed(device);
+        let shortest = siblings.min_by(|(_, one), (_, other)| backlog(one).total_cmp(&backlog(other)));
         shortest.map(|(index, _)| DeviceIndex(index))
     }
 
@@ -232,50 +264,9 @@ impl WorkerMachine {
         self.devices.get_mut(usize::from(index.0)).expect("held jobs are only on devices of this node")
     }
 
-    fn device_indices(&self) -> impl Iterator<Item = DeviceIndex> + use<> {
+    pub(super) fn device_indices(&self) -> impl Iterator<Item = DeviceIndex> + use<> {
         let count = u16::try_from(self.devices.len()).unwrap_or(u16::MAX);
         (0..count).map(DeviceIndex)
-    }
-
-    fn has_room(&mut self, index: DeviceIndex) -> bool {
-        let device = self.device_mut(index);
-        !device.lost && device.handed_over.len() < MAX_HANDED_OVER
-    }
-
-    /// Takes a job of the sibling with the longest queue, if that has at least `least` queued.
-    fn steal(&mut self, now: Instant, thief: DeviceIndex, least: usize) -> bool {
-        let Some(own) = self.devices.get(usize::from(thief.0)).filter(|device| !device.lost) else {
-            return false;
-        };
-        if own.queued_jobs > 0 {
-            return false;
-        }
-        let victims = (0_u16..).zip(&self.devices).filter(|(index, device)| {
-            *index != thief.0 && device.queued_jobs >= least && own.stands_in_for(device)
-        });
-        let longest = victims.max_by(|(_, one), (_, other)| one.backlog().total_cmp(&other.backlog()));
-        let Some(victim) = longest.map(|(index, _)| DeviceIndex(index)) else { return false };
-        self.hand_over(now, victim, thief)
-    }
-
-    /// Draws an application among those with jobs in a device's queue, and hands its first job to a device.
-    fn hand_over(&mut self, now: Instant, from: DeviceIndex, to: DeviceIndex) -> bool {
-        let Some(source) = self.devices.get(usize::from(from.0)) else { return false };
-        let Some(app) = self.share.draw(&mut source.queues.keys().copied(), &mut self.rng) else {
-            return false;
-        };
-        let Some(rank) = source.queues.get(&app).and_then(|queue| queue.first()).copied() else {
-            return false;
-        };
-        let Some(held) = self.jobs.get_mut(&rank.job) else { return false };
-        let stolen_from = (from != to).then_some(from);
-        held.state = HeldState::HandedOver(Handed { staged_at: now, started_at: None, stolen_from });
-        held.device = to;
-        let (attempt, cost) = (held.attempt, held.cost);
-        self.device_mut(from).dequeue(rank, cost);
-        self.device_mut(to).handed_over.push_back(rank.job);
-        self.push(Effect::Execute { job: JobAttempt { job: rank.job, attempt }, device: to });
-        true
     }
 
     fn move_or_give_back(&mut self, now: Instant, job: JobAttempt, lost: DeviceIndex) {
@@ -294,6 +285,6 @@ impl WorkerMachine {
     }
 }
 
-fn load_ns(cost: CostNs) -> u64 {
+pub(super) fn load_ns(cost: CostNs) -> u64 {
     if cost == CostNs(0) { UNKNOWN_COST_NS } else { cost.0 }
 }

@@ -110,8 +110,7 @@ impl WorkerMachine {
                 self.became_inactive(job.job.app);
             }
             HeldState::HandedOver(_) => {
-                self.device_mut(held.device).handed_over.retain(|other| *other != job.job);
-                self.became_inactive(job.job.app);
+                self.leave_executor(held.device, job.job);
             }
             HeldState::Executed(spooled) => self.spool_bytes -= spooled.size_bytes,
         }
@@ -123,11 +122,18 @@ impl WorkerMachine {
         Some(held)
     }
 
+    /// A job that was handed over is with its executor no more.
+    pub(super) fn leave_executor(&mut self, device: DeviceIndex, job: JobId) {
+        self.device_mut(device).handed_over.retain(|other| *other != job);
+        self.lags.unstage(job.app);
+        self.became_inactive(job.app);
+    }
+
     pub(super) fn became_active(&mut self, id: AppId) {
         let Some(app) = self.apps.get_mut(&id) else { return };
         app.active_jobs += 1;
         if app.active_jobs == 1 {
-            self.share.wake(id);
+            self.lags.wake(id);
         }
     }
 
@@ -135,7 +141,7 @@ impl WorkerMachine {
         let Some(app) = self.apps.get_mut(&id) else { return };
         app.active_jobs -= 1;
         if app.active_jobs == 0 {
-            self.share.rest(id);
+            self.lags.rest(id);
         }
     }
 

@@ -2,8 +2,17 @@
 
 use std::collections::BTreeMap;
 
-use super::{WorkerMachine, content::ContentState, drain::Drain, job::HeldState, report::Reports};
-use crate::id::{ContentHash, DeviceIndex};
+use super::{
+    WorkerMachine,
+    content::ContentState,
+    drain::Drain,
+    job::{HeldState, Phase},
+    report::Reports,
+};
+use crate::{
+    id::{ContentHash, DeviceIndex},
+    message::LatencyClass,
+};
 
 impl WorkerMachine {
     /// Asserts what must hold between any two events.
@@ -63,7 +72,7 @@ impl WorkerMachine {
             }
         }
         for (index, device) in (0_u16..).map(DeviceIndex).zip(&self.devices) {
-            assert!(device.handed_over.len() <= 2, "{index} has more than one running and one staged job");
+            self.check_executor(index);
             let empty = device.queued_jobs == 0 && device.handed_over.is_empty() && device.waiting_jobs == 0;
             assert!(!device.lost || empty, "I1: {index} is lost and holds jobs");
             assert_eq!(
@@ -92,6 +101,19 @@ impl WorkerMachine {
         );
         let with_executors: usize = self.devices.iter().map(|device| device.handed_over.len()).sum();
         assert_eq!(with_executors, handed_over, "I1: executors hold exactly the jobs handed over");
+    }
+
+    /// One runs, one is staged, and a third one only for the sake of an interactive job.
+    fn check_executor(&self, index: DeviceIndex) {
+        let there = &self.devices[usize::from(index.0)].handed_over;
+        let urgent = there.iter().any(|id| self.jobs[id].class == LatencyClass::Interactive);
+        assert!(there.len() <= 2 + usize::from(urgent), "{index} holds {} jobs", there.len());
+        let phases = there.iter().filter_map(|id| match &self.jobs[id].state {
+            HeldState::HandedOver(handed) => Some(handed.phase),
+            HeldState::Fetching { .. } | HeldState::Queued | HeldState::Executed(_) => None,
+        });
+        let running = |phase: &Phase| matches!(phase, Phase::Running { .. });
+        assert!(!phases.skip(1).any(|phase| running(&phase)), "{index}: what runs is first, and alone");
     }
 
     fn check_apps(&self) {

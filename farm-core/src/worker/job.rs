@@ -3,6 +3,7 @@
 use std::{
     cmp::Reverse,
     collections::{BTreeMap, VecDeque},
+    time::Duration,
 };
 
 use crate::{
@@ -57,17 +58,59 @@ pub(super) enum HeldState {
     Executed(Spooled),
 }
 
-/// How a job came to its executor.
+/// How a job came to its executor, and how it is there.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Handed {
     pub(super) staged_at: Instant,
-    /// `None` while it is only staged.
-    pub(super) started_at: Option<Instant>,
+    /// When it began to run for the first time.
+    started_at: Option<Instant>,
     /// The sibling whose queue it was taken from.
     pub(super) stolen_from: Option<DeviceIndex>,
+    pub(super) phase: Phase,
+    /// How long it ran before its last interruption.
+    ran_before: Duration,
+}
+
+/// What a job does at its executor.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Phase {
+    /// Its inputs are brought up.
+    Staged,
+    /// It has the device.
+    Running {
+        /// Since then without interruption.
+        since: Instant,
+    },
+    /// Another one has the device; its state stays there.
+    Interrupted,
 }
 
 impl Handed {
+    pub(super) const fn over(staged_at: Instant, stolen_from: Option<DeviceIndex>) -> Self {
+        Self { staged_at, started_at: None, stolen_from, phase: Phase::Staged, ran_before: Duration::ZERO }
+    }
+
+    pub(super) fn run(&mut self, now: Instant) {
+        self.pause(now);
+        self.started_at.get_or_insert(now);
+        self.phase = Phase::Running { since: now };
+    }
+
+    pub(super) fn pause(&mut self, now: Instant) {
+        if let Phase::Running { since } = self.phase {
+            self.ran_before = self.ran_before.saturating_add(now.since(since));
+            self.phase = Phase::Interrupted;
+        }
+    }
+
+    /// How long it has had the device, interruptions not counted.
+    pub(super) fn ran(&self, now: Instant) -> Duration {
+        match self.phase {
+            Phase::Staged | Phase::Interrupted => self.ran_before,
+            Phase::Running { since } => self.ran_before.saturating_add(now.since(since)),
+        }
+    }
+
     /// What is told of an attempt that ends now.
     pub(super) fn trace(self, now: Instant) -> JobTrace {
         JobTrace {

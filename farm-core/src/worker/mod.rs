@@ -4,8 +4,9 @@
 //! It never sees payloads: its driver keeps programs, contents and results by [`JobAttempt`] and [`ContentHash`].
 //!
 //! Split by event family: `session` (coordinator), `app` (applications and their links), `intake` (jobs that arrive or
-//! leave early), `retract` (jobs that another node takes over), `content`, `device` (staging, stealing, completion), `lottery`, `spool` (results until acknowledged),
-//! `report`, `drain`, `standing` (what auditors see). `job` holds the records they share.
+//! leave early), `retract` (jobs that another node takes over), `content`, `device` (completion, loss), `staging` (who
+//! is next on which device, stealing between them) with `rate`, `share` (with its rules `lottery` and `stride`), `spool`
+//! (results until acknowledged), `report`, `drain`, `standing` (what auditors see). `job` holds the records they share.
 
 mod app;
 mod content;
@@ -15,16 +16,21 @@ mod intake;
 mod invariants;
 mod job;
 mod lottery;
+mod rate;
 mod report;
 mod retract;
 mod session;
+mod share;
 mod spool;
+mod staging;
 mod standing;
+mod stride;
 
 use std::collections::{BTreeMap, VecDeque};
 
 use rand::{SeedableRng, rngs::SmallRng};
 
+pub use self::share::Share;
 pub use self::standing::Standing;
 use self::{
     app::App,
@@ -32,14 +38,16 @@ use self::{
     device::Device,
     drain::Drain,
     job::{HeldJob, Tombstones},
-    lottery::{FairShare, Lottery},
     report::Reports,
     session::Session,
+    share::{FairShare, Lags},
 };
 use crate::{
     device::DeviceInfo,
     id::{AppId, ContentHash, DeviceIndex, JobAttempt, JobId, LinkId, NodeId, NodeSession},
-    message::{AppToNode, Contact, CoordinatorToNode, JobFailure, NodeToApp, NodeToCoordinator},
+    message::{
+        AppToNode, Contact, CoordinatorToNode, JobFailure, LatencyClass, NodeToApp, NodeToCoordinator,
+    },
     program::Content,
     time::Instant,
 };
@@ -59,8 +67,8 @@ pub struct WorkerConfig {
     pub max_jobs: usize,
     /// Whether an idle device takes jobs of its siblings. On, but where its gain is measured.
     pub local_stealing: bool,
-    /// Gain of the lottery's feedback (10-scheduling.md section 2: c = 0.15).
-    pub lottery_gain: f64,
+    /// How devices are shared between applications.
+    pub share: Share,
     /// Seed of the machine's one generator.
     pub seed: u64,
 }
@@ -97,6 +105,20 @@ pub enum Event {
     },
     /// The staged job began to run.
     Started {
+        /// Which.
+        job: JobAttempt,
+        /// Where.
+        device: DeviceIndex,
+    },
+    /// The running job was interrupted at a launch boundary, for one of a higher class; it keeps its device state.
+    Yielded {
+        /// Which.
+        job: JobAttempt,
+        /// Where.
+        device: DeviceIndex,
+    },
+    /// An interrupted job goes on.
+    Resumed {
         /// Which.
         job: JobAttempt,
         /// Where.
@@ -148,12 +170,15 @@ pub enum Effect {
         /// The connection of the application that has it.
         link: LinkId,
     },
-    /// Hand a job to a device's executor, which holds at most one running and one staged job.
+    /// Hand a job to a device's executor, which holds at most one running and one staged job, and an interactive one
+    /// in addition: that takes the device at the running one's next launch boundary.
     Execute {
         /// Which.
         job: JobAttempt,
         /// Where.
         device: DeviceIndex,
+        /// When it may take the device.
+        class: LatencyClass,
     },
     /// Take a staged or running job back: it need not finish, and `Executed` with `Cancelled` may follow. Its place
     /// counts as free at once, so the next `Execute` may come while the executor still winds the aborted job up.
@@ -190,6 +215,7 @@ pub struct WorkerMachine {
     /// When contents that failed to come are asked for again.
     refetch_at: Option<Instant>,
     devices: Vec<Device>,
+    lags: Lags,
     share: Box<dyn FairShare>,
     rng: SmallRng,
     reports: Reports,
@@ -203,7 +229,7 @@ impl WorkerMachine {
     #[must_use]
     pub fn new(config: WorkerConfig) -> Self {
         let devices = config.devices.iter().cloned().map(Device::new).collect();
-        let share = Box::new(Lottery::new(config.lottery_gain));
+        let share = config.share.rule();
         let rng = SmallRng::seed_from_u64(config.seed);
         Self {
             config,
@@ -219,6 +245,7 @@ impl WorkerMachine {
             contents: BTreeMap::new(),
             refetch_at: None,
             devices,
+            lags: Lags::default(),
             share,
             rng,
             reports: Reports::default(),
@@ -240,7 +267,8 @@ impl WorkerMachine {
             Event::AppLinkClosed { link } => self.app_link_closed(now, link),
             Event::ContentReady(content) => self.content_ready(content),
             Event::ContentFailed { content, reason } => self.content_failed(now, content, &reason),
-            Event::Started { job, device } => self.started(now, job, device),
+            Event::Started { job, device } | Event::Resumed { job, device } => self.started(now, job, device),
+            Event::Yielded { job, device } => self.yielded(now, job, device),
             Event::Executed { job, device, device_time_ns, outcome } => {
                 self.executed(now, job, device, device_time_ns, outcome);
             }

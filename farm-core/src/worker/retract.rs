@@ -2,7 +2,10 @@
 //!
 //! This node alone says what may leave it. It never learns where a job goes.
 
-use super::{WorkerMachine, job::HeldState};
+use super::{
+    WorkerMachine,
+    job::{HeldState, Phase},
+};
 use crate::{
     id::{JobAttempt, StealId},
     message::NodeToCoordinator,
@@ -42,11 +45,12 @@ impl WorkerMachine {
         match self.jobs.get(&job.job) {
             Some(held) if held.attempt == job.attempt => match held.state {
                 HeldState::Fetching { .. } | HeldState::Queued => Found::Waiting,
-                // The first one runs or is about to; one behind it is only staged.
-                HeldState::HandedOver(_) => {
+                // The first one runs or is about to; one behind it is only staged, or goes on later.
+                HeldState::HandedOver(handed) => {
                     let device = self.devices.get(usize::from(held.device.0));
                     let first = device.and_then(|device| device.handed_over.front());
-                    if first == Some(&job.job) { Found::Begun } else { Found::Waiting }
+                    let begun = first == Some(&job.job) || handed.phase != Phase::Staged;
+                    if begun { Found::Begun } else { Found::Waiting }
                 }
                 HeldState::Executed(_) => Found::Begun,
             },

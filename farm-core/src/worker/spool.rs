@@ -23,8 +23,7 @@ impl WorkerMachine {
         held.state = HeldState::Executed(spooled);
         let contents = std::mem::take(&mut held.contents);
         let device = held.device;
-        self.device_mut(device).handed_over.retain(|other| *other != job.job);
-        self.became_inactive(job.job.app);
+        self.leave_executor(device, job.job);
         self.release_contents(job, &contents);
         self.send_result(job.job);
     }

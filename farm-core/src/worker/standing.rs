@@ -20,7 +20,7 @@ impl WorkerMachine {
         self.apps.iter().filter(|(_, app)| app.active_jobs > 0).map(|(&app, _)| {
             let mut devices = self.devices.iter().filter(|device| !device.lost);
             let backlogged = devices.all(|device| device.queues().contains_key(&app));
-            Standing { app, lag: self.share.lag(app), backlogged }
+            Standing { app, lag: self.lags.lag(app), backlogged }
         })
     }
 

@@ -36,12 +36,10 @@ use self::{
 };
 use crate::{
     error::{Busy, OpenError},
-    executor::{EventSink, ExecutorConfig, Order},
+    executor::{DEPTH, EventSink, ExecutorConfig, Order},
     spec::DeviceSpec,
 };
 
-/// Jobs held at once: one runs, one is staged.
-const DEPTH: usize = 2;
 /// Stack of a device's thread: naga recurses over the text of a module.
 const STACK_BYTES: usize = 16 << 20;
 

@@ -8,7 +8,7 @@ use std::{collections::BTreeMap, sync::Arc, time::Duration};
 use bytes::Bytes;
 use farm_core::{
     id::{ContentHash, JobAttempt},
-    message::JobFailure,
+    message::{JobFailure, LatencyClass},
     program::{Access, Buffer, Command, Kernel, ProgramQuota, ProgramSummary, Slicing, validate},
 };
 
@@ -43,6 +43,7 @@ impl Caches {
 #[derive(Debug)]
 pub(crate) struct Prepared {
     pub(crate) job: JobAttempt,
+    pub(crate) class: LatencyClass,
     pub(crate) limit: Duration,
     pub(crate) steps: Vec<Step>,
     /// Lengths of the result's sections.
@@ -210,7 +211,14 @@ fn attempt(
         }
         return Err(failure);
     }
-    Ok(Prepared { job: order.job, limit: order.limit, steps, sections: summary.sections.clone(), held })
+    Ok(Prepared {
+        job: order.job,
+        class: order.class,
+        limit: order.limit,
+        steps,
+        sections: summary.sections.clone(),
+        held,
+    })
 }
 
 struct Preparation<'a> {

@@ -13,7 +13,11 @@ use std::{
 };
 
 use bytes::Bytes;
-use farm_core::{device::DeviceKind, id::JobAttempt, message::JobFailure};
+use farm_core::{
+    device::DeviceKind,
+    id::JobAttempt,
+    message::{JobFailure, LatencyClass},
+};
 
 use super::{
     adapter::Gpu,
@@ -38,7 +42,10 @@ pub(crate) struct Hung(pub(crate) String);
 #[derive(Debug)]
 pub(crate) struct Run {
     pub(crate) job: JobAttempt,
+    pub(crate) class: LatencyClass,
+    /// When it began, moved on by its interruptions.
     started: Instant,
+    paused: Option<Instant>,
     limit: Duration,
     steps: VecDeque<Step>,
     /// Layers of the first step's launch that earlier runs did.
@@ -70,10 +77,12 @@ struct Recorded {
 
 impl Run {
     pub(crate) fn new(prepared: Prepared, now: Instant) -> Self {
-        let Prepared { job, limit, steps, sections, held } = prepared;
+        let Prepared { job, class, limit, steps, sections, held } = prepared;
         Self {
             job,
+            class,
             started: now,
+            paused: None,
             limit,
             steps: steps.into(),
             done_z: 0,
@@ -95,6 +104,27 @@ impl Run {
     /// Nothing is left to submit or to wait for.
     pub(crate) fn is_over(&self) -> bool {
         self.in_flight.is_empty() && (self.steps.is_empty() || self.ending.is_some())
+    }
+
+    /// Something is left to submit, and nothing on the way stands against making way.
+    pub(crate) fn can_yield(&self) -> bool {
+        !self.steps.is_empty() && self.ending.is_none()
+    }
+
+    /// Nothing of it is on the device's queue.
+    pub(crate) fn is_drained(&self) -> bool {
+        self.in_flight.is_empty()
+    }
+
+    /// Interrupted: its limit does not run on.
+    pub(crate) fn paused(self, now: Instant) -> Self {
+        Self { paused: Some(now), ..self }
+    }
+
+    /// Goes on.
+    pub(crate) fn resumed(self, now: Instant) -> Self {
+        let pause = self.paused.map_or(Duration::ZERO, |since| now.saturating_duration_since(since));
+        Self { started: self.started + pause, paused: None, ..self }
     }
 
     /// Whether submits for other jobs would not block: see [`MAX_IN_FLIGHT_CPU`].

@@ -1,9 +1,10 @@
-//! A device's thread: takes orders, keeps one running and one staged, replaces a device that hangs or is lost.
+//! A device's thread: takes orders, keeps one running, one interrupted and one of each class staged, replaces a device that hangs or is lost.
 //!
 //! A fault costs the running attempt only: the staged order is prepared again on the new device.
 
 use std::{
     any::Any,
+    cmp::Reverse,
     mem,
     panic::{AssertUnwindSafe, catch_unwind},
     sync::{
@@ -16,7 +17,10 @@ use std::{
 };
 
 use bytes::Bytes;
-use farm_core::{id::JobAttempt, message::JobFailure};
+use farm_core::{
+    id::JobAttempt,
+    message::{JobFailure, LatencyClass},
+};
 
 use super::{
     Shared,
@@ -62,17 +66,49 @@ struct State {
     caches: Caches,
     timestamps: TimestampPool,
     running: Option<Run>,
-    /// The order stays at hand: its preparation dies with the device.
-    staged: Option<(Order, Prepared)>,
+    /// Interrupted between two submits; its buffers stay as they are.
+    yielded: Option<Run>,
+    /// At most one of each class. The order stays at hand: its preparation dies with the device.
+    staged: Vec<(Order, Prepared)>,
     /// Orders not yet prepared; at most as many as the device holds.
     waiting: Vec<Order>,
 }
 
 impl State {
+    /// Whether a prepared order waits for the running job to make way. One that has nothing left to submit ends by itself.
+    fn makes_way(&self, running: &Run) -> bool {
+        self.yielded.is_none() && running.can_yield() && self.outranks(running.class)
+    }
+
+    fn outranks(&self, class: LatencyClass) -> bool {
+        self.staged.iter().any(|(order, _)| order.class > class)
+    }
+
+    /// Takes the prepared order of the highest class.
+    fn take_staged(&mut self) -> Option<Prepared> {
+        let (position, _) = self.staged.iter().enumerate().max_by_key(|(_, (order, _))| order.class)?;
+        Some(self.staged.remove(position).1)
+    }
+
+    /// The order to prepare next: the first of the highest class of which none is prepared.
+    fn next_to_prepare(&self) -> Option<usize> {
+        let prepared = |class| self.staged.iter().any(|(order, _)| order.class == class);
+        let open = self.waiting.iter().enumerate().filter(|(_, order)| !prepared(order.class));
+        open.max_by_key(|(position, order)| (order.class, Reverse(*position))).map(|(position, _)| position)
+    }
+
     fn new(gpu: Gpu, config: &ExecutorConfig) -> Self {
         let caches = Caches::new(&gpu, config);
         let timestamps = TimestampPool::default();
-        Self { gpu, caches, timestamps, running: None, staged: None, waiting: Vec::new() }
+        Self {
+            gpu,
+            caches,
+            timestamps,
+            running: None,
+            yielded: None,
+            staged: Vec::new(),
+            waiting: Vec::new(),
+        }
     }
 }
 
@@ -134,7 +170,7 @@ impl DeviceThread {
     /// Takes what has come; sleeps while there is nothing else to do. An error means that the handle is gone.
     fn take_messages(&mut self) -> Result<(), RecvError> {
         let state = &self.state;
-        if state.running.is_none() && state.staged.is_none() && state.waiting.is_empty() {
+        if state.running.is_none() && state.staged.is_empty() && state.waiting.is_empty() {
             let message = self.inbox.recv()?;
             self.take(message)?;
         }
@@ -161,15 +197,23 @@ impl DeviceThread {
         if let Some(position) = state.waiting.iter().position(|order| order.job == job) {
             state.waiting.remove(position);
             self.finished(job, 0, Err(JobFailure::Cancelled));
-        } else if let Some((_, prepared)) = state.staged.take_if(|(order, _)| order.job == job) {
+        } else if let Some(position) = state.staged.iter().position(|(order, _)| order.job == job) {
+            let (_, prepared) = state.staged.remove(position);
             prepared.held.release(&mut state.caches);
             self.finished(job, 0, Err(JobFailure::Cancelled));
+        } else if let Some(mut yielded) = state.yielded.take_if(|yielded| yielded.job == job) {
+            yielded.end_with(JobFailure::Cancelled, Instant::now());
+            let (device_time_ns, outcome) = yielded.finish(&mut state.caches);
+            self.finished(job, device_time_ns, outcome);
         } else if let Some(running) = state.running.as_mut().filter(|running| running.job == job) {
             running.end_with(JobFailure::Cancelled, Instant::now());
         }
     }
 
     fn submit(&mut self) {
+        if self.state.running.as_ref().is_some_and(|running| self.state.makes_way(running)) {
+            return;
+        }
         let State { gpu, timestamps, running, .. } = &mut self.state;
         if let Some(running) = running {
             running.fill(gpu, timestamps, self.config.submit_target);
@@ -181,41 +225,68 @@ impl DeviceThread {
         let queue_free = |state: &State| {
             state.running.as_ref().is_none_or(|running| running.leaves_the_queue_free(&state.gpu))
         };
-        while self.state.staged.is_none() && !self.state.waiting.is_empty() && queue_free(&self.state) {
-            let order = self.state.waiting.remove(0);
+        while queue_free(&self.state)
+            && let Some(position) = self.state.next_to_prepare()
+        {
+            let order = self.state.waiting.remove(position);
             let job = order.job;
             // A panic in here is the order's: it must not come back.
             let prepared =
                 catch_unwind(AssertUnwindSafe(|| prepare(&self.state.gpu, &mut self.state.caches, &order)))
                     .unwrap_or_else(|panic| Err(JobFailure::InvalidProgram(panic_text(panic.as_ref()))));
             match prepared {
-                Ok(prepared) => self.state.staged = Some((order, prepared)),
+                Ok(prepared) => self.state.staged.push((order, prepared)),
                 Err(failure) => self.finished(job, 0, Err(failure)),
             }
             self.hand_over();
         }
     }
 
-    /// Ends a job that is over and starts the staged one: its first submits go out before the old result is copied.
+    /// Ends a job that is over, or interrupts one that has to make way, and starts the next one: its first submits go out
+    /// before the old result is copied.
     fn hand_over(&mut self) {
         let over = self.state.running.take_if(|running| running.is_over());
-        if self.state.running.is_some() {
-            return;
+        if let Some(running) = self.state.running.take() {
+            if !(running.is_drained() && self.state.makes_way(&running)) {
+                self.state.running = Some(running);
+                return;
+            }
+            (self.on_event)(ExecutorEvent::Yielded { job: running.job });
+            self.state.yielded = Some(running.paused(Instant::now()));
         }
-        let next = self.state.staged.take().map(|(_, prepared)| {
-            let mut run = Run::new(prepared, Instant::now());
-            run.fill(&self.state.gpu, &mut self.state.timestamps, self.config.submit_target);
-            run
-        });
+        let next = self.next_run();
         if let Some(over) = over {
             let job = over.job;
             let (device_time_ns, outcome) = over.finish(&mut self.state.caches);
             self.finished(job, device_time_ns, outcome);
         }
-        if let Some(next) = next {
-            (self.on_event)(ExecutorEvent::Started { job: next.job });
+        if let Some((next, event)) = next {
+            (self.on_event)(event);
             self.state.running = Some(next);
         }
+    }
+
+    /// Starts what is prepared, or lets the interrupted job go on: that goes first, unless it is outranked.
+    fn next_run(&mut self) -> Option<(Run, ExecutorEvent)> {
+        let class = self.state.yielded.as_ref().map(|yielded| yielded.class);
+        let yielded = match class {
+            Some(class) if !self.state.outranks(class) => self.state.yielded.take(),
+            Some(_) | None => None,
+        };
+        let (mut run, event) = match yielded {
+            Some(yielded) => {
+                let run = yielded.resumed(Instant::now());
+                let event = ExecutorEvent::Resumed { job: run.job };
+                (run, event)
+            }
+            None => {
+                let run = Run::new(self.state.take_staged()?, Instant::now());
+                let event = ExecutorEvent::Started { job: run.job };
+                (run, event)
+            }
+        };
+        run.fill(&self.state.gpu, &mut self.state.timestamps, self.config.submit_target);
+        Some((run, event))
     }
 
     fn finished(&self, job: JobAttempt, device_time_ns: u64, outcome: Result<Vec<Bytes>, JobFailure>) {
@@ -224,20 +295,20 @@ impl DeviceThread {
         (self.on_event)(ExecutorEvent::Finished { job, device_time_ns, outcome });
     }
 
-    /// Ends the running attempt, leaves the device behind and opens a new one.
+    /// Ends the running attempt and the interrupted one, whose state is lost too, leaves the device behind and opens a new one.
     fn replace_device(&mut self, reason: &Hung) -> Result<(), String> {
         tracing::warn!(spec = %self.spec, reason = reason.0, "replacing the device");
         self.fail_running(reason);
         let opened = Gpu::reopen(self.spec);
         let gpu = opened.map_err(|error| format!("{}; it does not open again: {error}", reason.0))?;
         let mut old = mem::replace(&mut self.state, State::new(gpu, &self.config));
-        let staged = old.staged.take().map(|(order, _)| order);
-        self.state.waiting = staged.into_iter().chain(mem::take(&mut old.waiting)).collect();
+        let staged = mem::take(&mut old.staged).into_iter().map(|(order, _)| order);
+        self.state.waiting = staged.chain(mem::take(&mut old.waiting)).collect();
         self.leave_behind(old).map_err(|error| format!("{}; {error}", reason.0))
     }
 
     fn fail_running(&mut self, reason: &Hung) {
-        if let Some(running) = self.state.running.take() {
+        for running in [self.state.running.take(), self.state.yielded.take()].into_iter().flatten() {
             let job = running.job;
             let (device_time_ns, failure) = running.abandon(reason);
             self.finished(job, device_time_ns, Err(failure));
@@ -267,8 +338,8 @@ impl DeviceThread {
     fn lose(mut self, reason: String) {
         self.shared.lost.store(true, Ordering::Release);
         let failure = || Err(JobFailure::DeviceLost(reason.clone()));
-        let staged = self.state.staged.take().map(|(order, _)| order);
-        for order in staged.into_iter().chain(mem::take(&mut self.state.waiting)) {
+        let staged = mem::take(&mut self.state.staged).into_iter().map(|(order, _)| order);
+        for order in staged.chain(mem::take(&mut self.state.waiting)) {
             self.finished(order.job, 0, failure());
         }
         (self.on_event)(ExecutorEvent::Lost { reason: reason.clone() });

@@ -12,7 +12,7 @@ use std::{
 use bytes::Bytes;
 use farm_core::{
     id::{AppId, Attempt, ContentHash, Epoch, JobAttempt, JobId, JobIndex, TaskId},
-    message::JobFailure,
+    message::{JobFailure, LatencyClass},
     program::{Content, JobProgram},
 };
 use gpu_exec::{DeviceSpec, Executor, ExecutorConfig, ExecutorEvent, Order, expand};
@@ -51,6 +51,7 @@ impl TestDevice {
         let job = JobId { app: AppId(1), task: TaskId(1), index: JobIndex(1) };
         Order {
             job: JobAttempt { job, attempt: Attempt { epoch: Epoch(1), sequence } },
+            class: LatencyClass::Batch,
             program: Arc::new(program),
             contents: contents.to_vec(),
             limit: PATIENCE,
@@ -84,6 +85,9 @@ impl TestDevice {
                 ExecutorEvent::Finished { job, device_time_ns, outcome } => {
                     assert_eq!(job, wanted, "another job finished");
                     return (device_time_ns, outcome);
+                }
+                ExecutorEvent::Yielded { job } | ExecutorEvent::Resumed { job } => {
+                    panic!("{job} was interrupted")
                 }
                 ExecutorEvent::Lost { reason } => panic!("device lost: {reason}"),
             }

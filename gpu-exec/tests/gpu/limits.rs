@@ -52,14 +52,17 @@ fn empty(device: &TestDevice) -> Order {
 }
 
 #[test]
-fn one_runs_one_is_staged_and_a_third_is_refused() {
+fn three_are_held_and_a_fourth_is_refused() {
     let device = TestDevice::open();
     let (running, staged, third) = (endless(&device), empty(&device), empty(&device));
     let jobs = [running.job, staged.job, third.job];
     device.executor.submit(running).unwrap();
     assert_eq!(device.next_event(), ExecutorEvent::Started { job: jobs[0] });
     device.executor.submit(staged).unwrap();
-    assert_eq!(device.executor.submit(third), Err(Busy::Full { job: jobs[2] }));
+    device.executor.submit(third).unwrap();
+    let fourth = empty(&device);
+    let job = fourth.job;
+    assert_eq!(device.executor.submit(fourth), Err(Busy::Full { job }));
 
     device.executor.abort(jobs[0]);
     let (device_time_ns, outcome) = device.finished(jobs[0]);

@@ -12,3 +12,4 @@ mod device;
 mod faults;
 mod limits;
 mod memory;
+mod yields;

@@ -81,11 +81,19 @@ impl Device {
             job: JobId { app: AppId(1), task: TaskId(0), index: JobIndex(0) },
             attempt: Attempt { epoch: Epoch(1), sequence: 1 },
         };
-        let order = Order { job, program: Arc::new(program), contents, limit: LIMIT };
+        let order = Order {
+            job,
+            class: farm_core::message::LatencyClass::Batch,
+            program: Arc::new(program),
+            contents,
+            limit: LIMIT,
+        };
         self.executor.submit(order).expect("the device is idle");
         loop {
             match self.inbox.recv_timeout(LIMIT).expect("the executor ends every job within its limit") {
-                ExecutorEvent::Started { .. } => {}
+                ExecutorEvent::Started { .. }
+                | ExecutorEvent::Yielded { .. }
+                | ExecutorEvent::Resumed { .. } => {}
                 ExecutorEvent::Finished { outcome, .. } => return outcome.expect("the job is sound"),
                 ExecutorEvent::Lost { reason } => panic!("device lost: {reason}"),
             }

@@ -10,7 +10,7 @@ use farm_core::{
     id::{Attempt, ContentHash, DeviceIndex, JobAttempt, JobId, LinkId, NodeSession},
     message::{AppToNode, Contact, CoordinatorToNode, JobFailure, NodeToApp},
     time::Instant,
-    worker::{Effect, Event, WorkerConfig, WorkerMachine},
+    worker::{Effect, Event, Share, WorkerConfig, WorkerMachine},
 };
 use rand::Rng;
 
@@ -125,7 +125,7 @@ impl WorkerHost {
                 certificate_der: Vec::new(),
             },
             max_jobs: self.max_jobs,
-            lottery_gain: 0.15,
+            share: Share::DEFAULT,
             local_stealing: true,
             seed,
         }));
@@ -262,7 +262,7 @@ impl World {
             }
             Effect::CloseApp { link } => self.hang_up(proc, link),
             Effect::Fetch { content, link } => self.fetch(index, content.hash, link),
-            Effect::Execute { job, device } => self.execute(index, job, device),
+            Effect::Execute { job, device, .. } => self.execute(index, job, device),
             Effect::Abort { job, device } => self.abort(index, job, device),
             Effect::Discard(job) => {
                 self.workers[index].programs.remove(&job);
