@@ -109,7 +109,7 @@ fn coordinator_event(step: Step) -> coordinator::Event {
                 limits: Limits { memory_bytes: 1 << (20 + step.three), ..Limits::NONE },
                 ..Requirements::ANY
             },
-            module: (step.one % 2 == 0).then_some(ContentHash([step.two; 32])),
+            module: step.one.is_multiple_of(2).then_some(ContentHash([step.two; 32])),
             contents: vec![content(1)],
         })),
         8 => from_app(AppToCoordinator::AlreadyDelivered(vec![
@@ -206,7 +206,11 @@ fn worker_event(step: Step) -> worker::Event {
                 .map(|index| JobTicket {
                     job: attempt(step.one % 2, index + step.two, step.four),
                     device: DeviceIndex(u16::from(step.two)),
-                    class: if step.one % 3 == 0 { LatencyClass::Interactive } else { LatencyClass::Batch },
+                    class: if step.one.is_multiple_of(3) {
+                        LatencyClass::Interactive
+                    } else {
+                        LatencyClass::Batch
+                    },
                     priority: Priority(step.three.into()),
                     cost: CostNs(step.two.into()),
                     contents: (0..step.three).map(content).collect(),
