@@ -109,7 +109,7 @@ fn coordinator_event(step: Step) -> coordinator::Event {
                 limits: Limits { memory_bytes: 1 << (20 + step.three), ..Limits::NONE },
                 ..Requirements::ANY
             },
-            module: (step.one.is_multiple_of(2)).then_some(ContentHash([step.two; 32])),
+            module: step.one.is_multiple_of(2).then_some(ContentHash([step.two; 32])),
             contents: vec![content(1)],
         })),
         8 => from_app(AppToCoordinator::AlreadyDelivered(vec![

@@ -140,8 +140,8 @@ impl Lags {
 
     /// One of its jobs took this much, in device seconds x score.
     pub(super) fn charge(&mut self, app: AppId, cost: f64) {
-        let known = self.entrants.contains_key(&app);
-        if !(known && cost.is_finite() && cost > 0.0) {
+        let counts = cost.is_finite() && cost > 0.0;
+        if !counts || !self.entrants.contains_key(&app) {
             return;
         }
         self.remember(cost);
