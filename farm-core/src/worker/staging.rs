@@ -7,7 +7,7 @@ use super::{
     job::{Handed, HeldState, Phase, Rank},
 };
 use crate::{
-    id::{AppId, DeviceIndex, JobAttempt},
+    id::{AppId, DeviceIndex, JobAttempt, JobId},
     message::{CostNs, LatencyClass},
     time::Instant,
 };
@@ -24,7 +24,7 @@ impl WorkerMachine {
     pub(super) fn fill_devices(&mut self, now: Instant) {
         for places in 1..=MAX_HANDED_OVER {
             if self.devices.iter().all(|device| device.queued_jobs == 0) {
-                return;
+                break;
             }
             for index in self.device_indices() {
                 while self.has_room(index, places) && self.hand_over_next(now, index) {}
@@ -34,6 +34,13 @@ impl WorkerMachine {
                     if self.has_room(index, places) {
                         self.steal(now, index);
                     }
+                }
+            }
+        }
+        if self.config.local_stealing && self.devices.iter().any(|device| device.handed_over.len() > 1) {
+            for index in self.device_indices() {
+                if self.has_room(index, 1) {
+                    self.steal_staged(now, index);
                 }
             }
         }
@@ -147,6 +154,37 @@ impl WorkerMachine {
         if here <= starts_there && end - (here + takes(own, &rank)) > LEAST_GAIN * end {
             self.hand_over(now, rank, victim, thief);
         }
+    }
+
+    /// An idle device takes what is only staged on a sibling, if that ends sooner here: at the end of a run nothing else is
+    /// left. What the sibling has prepared for it is lost.
+    fn steal_staged(&mut self, now: Instant, thief: DeviceIndex) {
+        let own = &self.devices[usize::from(thief.0)];
+        let mut best: Option<(f64, DeviceIndex, JobId)> = None;
+        for (index, victim) in (0_u16..).map(DeviceIndex).zip(&self.devices) {
+            let Some(&id) = victim.handed_over.back().filter(|_| victim.handed_over.len() > 1) else {
+                continue;
+            };
+            let Some(held) = self.jobs.get(&id) else { continue };
+            let staged = matches!(held.state, HeldState::HandedOver(handed) if handed.phase == Phase::Staged);
+            if !staged || !own.stands_in_for(victim) {
+                continue;
+            }
+            let there = self.remaining_ns(now, victim);
+            let gain = there - self.takes_ns(own, held.cost);
+            if gain > LEAST_GAIN * there && best.is_none_or(|(most, ..)| gain > most) {
+                best = Some((gain, index, id));
+            }
+        }
+        let Some((_, victim, id)) = best else { return };
+        let Some(held) = self.jobs.get_mut(&id) else { return };
+        held.state = HeldState::HandedOver(Handed::over(now, Some(victim)));
+        held.device = thief;
+        let (job, class) = (JobAttempt { job: id, attempt: held.attempt }, held.class);
+        self.device_mut(victim).handed_over.retain(|other| *other != id);
+        self.device_mut(thief).handed_over.push_back(id);
+        self.push(Effect::Abort { job, device: victim });
+        self.push(Effect::Execute { job, device: thief, class });
     }
 
     /// How long a device still takes for what its executor holds, in nanoseconds.

@@ -1,0 +1,6 @@
+//! A worker's machine by itself: what it hands to which device, seen from its effects.
+
+#![allow(clippy::unwrap_used, reason = "a test that cannot go on panics")]
+
+mod node;
+mod staging;

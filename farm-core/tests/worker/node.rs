@@ -1,0 +1,143 @@
+//! A node of equal devices with applications on it, driven by hand.
+
+use std::time::Duration;
+
+use farm_core::{
+    device::{DeviceInfo, DeviceKind, Features, Limits},
+    id::{
+        AppId, AppIncarnation, Attempt, ContentHash, DeviceIndex, Epoch, JobAttempt, JobId, JobIndex, LinkId,
+        NodeId, NodeSession, TaskId,
+    },
+    message::{
+        AppToNode, Contact, CoordinatorToNode, CostNs, JobFailure, JobTicket, LatencyClass, Liveness,
+        NodeToCoordinator, PROTOCOL_VERSION, Priority,
+    },
+    time::Instant,
+    worker::{Effect, Event, Share, WorkerConfig, WorkerMachine},
+};
+
+pub(crate) const MILLISECOND_NS: u64 = 1_000_000;
+
+pub(crate) struct Node {
+    pub(crate) machine: WorkerMachine,
+    pub(crate) now: Instant,
+    next_job: u32,
+    /// Orders to the executors, in order: what begins with `true` was handed over, else taken back.
+    pub(crate) orders: Vec<(bool, u16, JobAttempt)>,
+    pub(crate) said: Vec<NodeToCoordinator>,
+}
+
+impl Node {
+    pub(crate) fn new(devices: usize, local_stealing: bool, apps: u64) -> Self {
+        let device = DeviceInfo {
+            name: "sim".to_owned(),
+            kind: DeviceKind::Simulated,
+            score: 1_000.0,
+            features: Features::default(),
+            limits: Limits::UNBOUNDED,
+        };
+        let machine = WorkerMachine::new(WorkerConfig {
+            name: "node".to_owned(),
+            session: NodeSession(1),
+            devices: vec![device; devices],
+            contact: Contact { addresses: Vec::new(), certificate_der: Vec::new() },
+            max_jobs: 1_000,
+            local_stealing,
+            share: Share::DEFAULT,
+            seed: 1,
+        });
+        let mut node =
+            Self { machine, now: Instant::ZERO, next_job: 0, orders: Vec::new(), said: Vec::new() };
+        node.tell(Event::CoordinatorConnected);
+        let (id, epoch, liveness) = (NodeId(1), Epoch(1), Liveness::default());
+        node.tell(Event::FromCoordinator(CoordinatorToNode::Welcome { node: id, epoch, liveness }));
+        for app in 1..=apps {
+            node.tell(Event::FromCoordinator(CoordinatorToNode::AppJoined { app: AppId(app), weight: 1.0 }));
+            let hello = AppToNode::Hello {
+                protocol: PROTOCOL_VERSION,
+                app: AppId(app),
+                incarnation: AppIncarnation(1),
+            };
+            node.tell(Event::FromApp { link: LinkId(app), message: hello });
+        }
+        node
+    }
+
+    pub(crate) fn tell(&mut self, event: Event) {
+        self.machine.handle(self.now, event);
+        while let Some(effect) = self.machine.poll_effect() {
+            match effect {
+                Effect::Execute { job, device, .. } => self.orders.push((true, device.0, job)),
+                Effect::Abort { job, device } => self.orders.push((false, device.0, job)),
+                Effect::ToCoordinator(message) => self.said.push(message),
+                _ => {}
+            }
+        }
+        self.machine.check_invariants();
+    }
+
+    /// Jobs of 10 ms arrive together, planned for one device.
+    pub(crate) fn jobs(&mut self, app: u64, device: u16, count: u32, class: LatencyClass) -> Vec<JobAttempt> {
+        self.tickets(app, device, count, class, |_| Priority(0))
+    }
+
+    pub(crate) fn tickets(
+        &mut self,
+        app: u64,
+        device: u16,
+        count: u32,
+        class: LatencyClass,
+        priority: impl Fn(u32) -> Priority,
+    ) -> Vec<JobAttempt> {
+        let tickets: Vec<JobTicket> = (0..count)
+            .map(|nth| {
+                self.next_job += 1;
+                let job = JobId { app: AppId(app), task: TaskId(0), index: JobIndex(self.next_job) };
+                let attempt = Attempt { epoch: Epoch(1), sequence: self.next_job.into() };
+                JobTicket {
+                    job: JobAttempt { job, attempt },
+                    device: DeviceIndex(device),
+                    class,
+                    priority: priority(nth),
+                    cost: CostNs(10 * MILLISECOND_NS),
+                    contents: Vec::new(),
+                }
+            })
+            .collect();
+        let jobs = tickets.iter().map(|ticket| ticket.job).collect();
+        self.tell(Event::FromApp { link: LinkId(app), message: AppToNode::Jobs(tickets) });
+        jobs
+    }
+
+    pub(crate) fn pass_ms(&mut self, ms: u64) {
+        self.now = self.now.after(Duration::from_millis(ms));
+    }
+
+    pub(crate) fn started(&mut self, job: JobAttempt, device: u16) {
+        self.tell(Event::Started { job, device: DeviceIndex(device) });
+    }
+
+    pub(crate) fn done(&mut self, job: JobAttempt, device: u16) {
+        let outcome = Ok((Vec::new(), ContentHash::EMPTY));
+        self.ended(job, device, 10 * MILLISECOND_NS, outcome);
+    }
+
+    pub(crate) fn cancelled(&mut self, job: JobAttempt, device: u16) {
+        self.ended(job, device, 0, Err(JobFailure::Cancelled));
+    }
+
+    /// Orders given since the last call.
+    pub(crate) fn orders(&mut self) -> Vec<(bool, u16, JobAttempt)> {
+        std::mem::take(&mut self.orders)
+    }
+
+    fn ended(
+        &mut self,
+        job: JobAttempt,
+        device: u16,
+        device_time_ns: u64,
+        outcome: Result<(Vec<u64>, ContentHash), JobFailure>,
+    ) {
+        self.tell(Event::Executed { job, device: DeviceIndex(device), device_time_ns, outcome });
+    }
+}
