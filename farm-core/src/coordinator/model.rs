@@ -87,6 +87,8 @@ pub(super) struct Job {
     pub(super) state: JobState,
     /// Attempts that ended with their device or node.
     pub(super) crashes: u32,
+    /// Attempts that ended because a node could not get its contents.
+    pub(super) starved: u32,
     /// The node that lost it last: another one is preferred.
     pub(super) avoid: Option<NodeId>,
     /// Nodes it was stolen from, in order: it is never stolen back.

@@ -375,6 +375,7 @@ fn take_in(app: &mut App, request: &PlanRequest, module: Module) -> Intake {
                     cost,
                     state: JobState::Waiting,
                     crashes: 0,
+                    starved: 0,
                     avoid: None,
                     stolen_from: Vec::new(),
                 };

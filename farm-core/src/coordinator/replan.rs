@@ -10,7 +10,7 @@ use super::{
     model::{Job, JobState, Recheck},
 };
 use crate::{
-    id::{AppId, Attempt, DeviceIndex, JobAttempt, JobId, JobKey, NodeId, NodeSession, TaskId},
+    id::{AppId, Attempt, ContentHash, DeviceIndex, JobAttempt, JobId, JobKey, NodeId, NodeSession, TaskId},
     message::{CoordinatorToApp, CoordinatorToNode, JobFailure, NodeHello},
     time::Instant,
 };
@@ -20,6 +20,9 @@ const UNREACHABLE_MS: u64 = 60_000;
 
 /// Most failures of one application that are remembered for repetition; beyond it the smallest ids are forgotten.
 const MAX_REMEMBERED_FAILURES: usize = 4_096;
+
+/// Attempts of one job that may end because a node could not get its contents; each of them is three tries of that node.
+const MAX_STARVED: u32 = 8;
 
 /// On each device a node runs one job and has staged one: only these can have brought it down.
 const SUSPECT_JOBS_PER_DEVICE: usize = 2;
@@ -228,6 +231,17 @@ impl CoordinatorMachine {
         );
         self.fail_job(id, JobFailure::Poison(reason));
         true
+    }
+
+    /// A node could not get what a job needs: no executor crashed, but it cannot go on for ever.
+    pub(super) fn starved(&mut self, id: JobId, content: ContentHash, node: NodeId) {
+        let Some(job) = self.job_mut(id) else { return };
+        job.starved = job.starved.saturating_add(1);
+        if job.starved >= MAX_STARVED {
+            self.fail_job(id, JobFailure::ContentUnavailable(content));
+        } else {
+            self.requeue(id, Some(node));
+        }
     }
 
     /// Takes a job off its place and puts it into line for a new attempt; one that runs elsewhere too just goes on

@@ -72,6 +72,7 @@ impl CoordinatorMachine {
                 }
                 self.requeue(id, Some(node));
             }
+            Some(JobFailure::ContentUnavailable(content)) => self.starved(id, content, node),
             Some(failure) if failure.can_be_retried() => self.crashed(id, failure, node),
             // Its application gets this failure from the node, as a result; nothing else is owed.
             Some(_) => {
