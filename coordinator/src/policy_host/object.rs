@@ -5,7 +5,7 @@
 
 #![allow(
     unsafe_code,
-    reason = "loading a shared object and calling into it; agreed on in docs/adr/0005-plug-ins-in-a-child-process.md"
+    reason = "loading a shared object and calling into it; agreed on in docs/adr/0007-plug-ins-in-a-child-process.md"
 )]
 
 use std::{

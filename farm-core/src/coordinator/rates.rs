@@ -8,9 +8,10 @@ use std::collections::BTreeMap;
 
 use crate::id::ContentHash;
 
-/// Weight of a new throughput sample in a rate. 0.2 follows a change of speed within ten jobs and lets one outlier
-/// move the rate by a fifth at most of its (bounded) distance.
-const RATE_GAIN: f64 = 0.2;
+/// Least weight of a new throughput sample in a rate; the first samples weigh alike. Where applications do not know what
+/// their jobs cost, samples scatter like the jobs (by a fifth in a render): at 0.05 a rate scatters by 3 %, and a change of speed
+/// is followed within forty jobs.
+const LEAST_RATE_GAIN: f64 = 0.05;
 
 /// A sample counts as at most this many times faster or slower than the rate so far: one warm-up launch or one job of
 /// wrong cost must not starve or flood a device.
@@ -77,13 +78,13 @@ impl Modules {
 
     /// Whether a job of it was completed.
     pub(super) fn is_known(&self, module: Module) -> bool {
-        self.entries.get(&module).is_some_and(|entry| entry.scale.0.is_some())
+        self.entries.get(&module).is_some_and(|entry| entry.scale.value.is_some())
     }
 
     /// Load per time that a point of score stands for.
     fn scale(&self, module: Module) -> f64 {
-        let own = self.entries.get(&module).and_then(|entry| entry.scale.0);
-        own.or(self.overall.0).unwrap_or(1.0)
+        let own = self.entries.get(&module).and_then(|entry| entry.scale.value);
+        own.or(self.overall.value).unwrap_or(1.0)
     }
 
     fn observe(&mut self, module: Module, sample: f64) {
@@ -114,12 +115,12 @@ struct ModuleThroughput {
 
 impl Throughput {
     pub(super) const fn new(score: f64) -> Self {
-        Self { score, bias: Mean(None), modules: Vec::new() }
+        Self { score, bias: Mean::NONE, modules: Vec::new() }
     }
 
     /// Load of a module per nanosecond.
     pub(super) fn rate(&self, modules: &Modules, module: Module) -> f64 {
-        let measured = self.find(module).and_then(|found| found.rate.0);
+        let measured = self.find(module).and_then(|found| found.rate.value);
         measured.unwrap_or_else(|| self.points() * modules.scale(module))
     }
 
@@ -141,7 +142,7 @@ impl Throughput {
                 self.forget_idle();
                 self.modules.push(ModuleThroughput {
                     module: load.module,
-                    rate: Mean(None),
+                    rate: Mean::NONE,
                     queued: 0,
                     jobs: 0,
                 });
@@ -169,13 +170,13 @@ impl Throughput {
         self.bias.observe(sample / (self.score * modules.scale(load.module)));
         let prior = self.points() * modules.scale(load.module);
         if let Some(found) = self.modules.iter_mut().find(|found| found.module == load.module) {
-            found.rate.0.get_or_insert(prior);
+            found.rate.presume(prior);
             found.rate.observe(sample);
         }
     }
 
     fn points(&self) -> f64 {
-        self.score * self.bias.0.unwrap_or(1.0)
+        self.score * self.bias.value.unwrap_or(1.0)
     }
 
     fn find(&self, module: Module) -> Option<&ModuleThroughput> {
@@ -193,15 +194,29 @@ impl Throughput {
 
 /// A mean of positive samples that forgets the older ones; `None` before the first.
 #[derive(Clone, Copy, Debug, Default)]
-struct Mean(Option<f64>);
+struct Mean {
+    value: Option<f64>,
+    samples: u32,
+}
 
 impl Mean {
+    const NONE: Self = Self { value: None, samples: 0 };
+
+    /// Something to begin with, which counts as one sample.
+    fn presume(&mut self, value: f64) {
+        if self.value.is_none() {
+            *self = Self { value: Some(value), samples: 1 };
+        }
+    }
+
     fn observe(&mut self, sample: f64) {
-        self.0 = Some(match self.0 {
+        self.samples = self.samples.saturating_add(1);
+        self.value = Some(match self.value {
             None => sample,
             Some(so_far) => {
                 let sample = sample.clamp(so_far / MAX_RATE_STEP, so_far * MAX_RATE_STEP);
-                so_far + RATE_GAIN * (sample - so_far)
+                let gain = (1.0 / f64::from(self.samples)).max(LEAST_RATE_GAIN);
+                so_far + gain * (sample - so_far)
             }
         });
     }

@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use farm_core::{
     coordinator::Whereabouts,
-    id::{JobAttempt, JobId, NodeId},
+    id::{AppId, JobAttempt, JobId, NodeId},
     message::{AppToCoordinator, NodeToCoordinator},
     time::Instant,
 };
@@ -74,6 +74,9 @@ impl World {
             {
                 self.lookout.excuse(self.now, FULL);
             }
+            // It was away until now: what waited for it is not planned yet.
+            Message::AppToCoordinator(AppToCoordinator::Hello(_))
+            | Message::NodeToCoordinator(NodeToCoordinator::Hello(_)) => self.lookout.excuse(self.now, FULL),
             _ => {}
         }
     }
@@ -174,6 +177,11 @@ impl World {
         self.audit.checks.idle_devices += idle;
     }
 
+    /// Whether an application can be told where its jobs go.
+    fn is_present(&self, app: AppId) -> bool {
+        self.apps.iter().any(|host| host.is_active() && host.ledger.app() == Some(app))
+    }
+
     /// Notes who has more queued work than a steal from it by the slowest device could need, whatever the estimates.
     fn note_riches(&mut self) {
         let now = self.now;
@@ -187,7 +195,8 @@ impl World {
             .iter()
             .map(|host| {
                 let speed: f64 = host.well_devices().map(|(_, speed, _)| speed).sum();
-                let movable = host.queued().filter(|job| self.audit.may_move(*job));
+                let movable =
+                    host.queued().filter(|job| self.audit.may_move(*job) && self.is_present(job.job.app));
                 let work_ns: u64 = movable.map(|job| cost_ns(job.job.index)).sum();
                 stealing && !host.leaves() && host.is_well() && work_ns as f64 / 1e9 > least_s * speed
             })
