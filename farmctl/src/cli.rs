@@ -105,6 +105,9 @@ pub(crate) struct RenderArgs {
     /// Brightness of the PNG in stops.
     #[arg(long, default_value_t = 0.0, allow_negative_numbers = true, value_parser = stops)]
     pub exposure: f32,
+    /// How the coordinator spreads the jobs: fcfs, history, or the name of a plug-in of its own.
+    #[arg(long, value_name = "NAME", default_value = "fcfs")]
+    pub policy: String,
     /// How progress is told.
     #[arg(long, value_enum, default_value_t = ProgressStyle::Auto)]
     pub progress: ProgressStyle,
@@ -135,6 +138,9 @@ pub(crate) struct MiArgs {
     /// How many pairs the table holds; five a column without it.
     #[arg(long, value_name = "PAIRS")]
     pub top: Option<usize>,
+    /// How the coordinator spreads the jobs: fcfs, history, or the name of a plug-in of its own.
+    #[arg(long, value_name = "NAME", default_value = "fcfs")]
+    pub policy: String,
     /// How progress is told.
     #[arg(long, value_enum, default_value_t = ProgressStyle::Auto)]
     pub progress: ProgressStyle,
@@ -239,6 +245,9 @@ pub(crate) struct BenchArgs {
     /// Runs of each measurement, of which the median counts; each bench has its own default.
     #[arg(long, value_parser = clap::value_parser!(u8).range(1..=25))]
     pub runs: Option<u8>,
+    /// Where `steal` leaves pictures of its last runs (SVG): figures 5.11 and 5.12 of the thesis.
+    #[arg(long, value_name = "FOLDER")]
+    pub pictures: Option<PathBuf>,
     /// How they are printed (as before the verb).
     #[arg(short = 'o', long, value_enum, id = "bench_format")]
     pub output: Option<Format>,

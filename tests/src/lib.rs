@@ -199,8 +199,17 @@ impl Farm {
     /// It does not become ready.
     #[must_use]
     pub fn coordinator() -> Self {
-        let mut coordinator =
-            Process::start("farm-coordinator", ["--listen", "127.0.0.1:0", "--http", "127.0.0.1:0"]);
+        Self::coordinator_with(&[])
+    }
+
+    /// A coordinator without workers, with further arguments.
+    ///
+    /// # Panics
+    /// It does not become ready.
+    #[must_use]
+    pub fn coordinator_with(arguments: &[&str]) -> Self {
+        let fixed = ["--listen", "127.0.0.1:0", "--http", "127.0.0.1:0"];
+        let mut coordinator = Process::start("farm-coordinator", fixed.iter().chain(arguments));
         let ready = coordinator.next_json();
         assert_eq!(ready["event"], "ready", "the coordinator's first line: {ready}");
         let address = |key: &str| ready[key].as_str().expect("an address").to_owned();

@@ -103,7 +103,7 @@ async fn measure(arguments: &BenchArgs) -> anyhow::Result<Vec<Figure>> {
     let runs = |default: usize| arguments.runs.map_or(default, usize::from);
     match arguments.name {
         BenchName::Scheduler => scheduler::measure(runs(5)).await,
-        BenchName::Steal => steal::measure(arguments.seed, runs(5)).await,
+        BenchName::Steal => steal::measure(arguments.seed, runs(5), arguments.pictures.as_deref()).await,
         BenchName::Fairness => fairness::measure(arguments.seed, runs(1)).await,
         BenchName::Scaling => scaling::measure(runs(3)).await,
     }

@@ -7,13 +7,14 @@
 //! Each run has a farm of its own, so that none profits from what another one taught the coordinator. Links and the
 //! module are there before the clock starts: they are milliseconds, and so are, at this scale, the jobs.
 
-use std::collections::BTreeMap;
+use std::{collections::BTreeMap, fs, path::Path};
 
+use anyhow::Context as _;
 use client_sdk::{CostNs, Farm, FarmOptions, TaskGraph};
 use farm_core::{
     coordinator::{
         policy::{FCFS, HISTORY},
-        timeline::{Migration, Segment, TimelineQuery},
+        timeline::{MAX_SEGMENTS, Migration, Segment, Timeline, TimelineQuery},
     },
     id::{DeviceIndex, NodeId},
 };
@@ -30,6 +31,7 @@ use crate::{
     admin::Admin,
     output,
     process_farm::{Shape, Stealing},
+    timeline::{Chart, svg},
 };
 
 /// Workers, as in the thesis' cluster (5.6).
@@ -73,7 +75,7 @@ struct SimDevice {
 }
 
 /// Measures all settings.
-pub(super) async fn measure(seed: u64, runs: usize) -> anyhow::Result<Vec<Figure>> {
+pub(super) async fn measure(seed: u64, runs: usize, pictures: Option<&Path>) -> anyhow::Result<Vec<Figure>> {
     let mut figures = Vec::new();
     let [none, global, local, full] = MODES.map(|(mode, ..)| mode);
     let mut table = output::table([
@@ -94,15 +96,21 @@ pub(super) async fn measure(seed: u64, runs: usize) -> anyhow::Result<Vec<Figure
         let mut second_frames_ms = Vec::new();
         // The modes take turns: what else the machine does meets all of them.
         for _ in 0..runs {
-            for (makespans_ms, (_, local, global)) in makespans_ms.iter_mut().zip(MODES) {
+            for (makespans_ms, (mode, local, global)) in makespans_ms.iter_mut().zip(MODES) {
                 let ran = run(&setting.devices, &tiles, local, global, FCFS).await?;
                 makespans_ms.push(ran.makespan_ms);
                 if (local, global) == (Stealing::On, Stealing::On) {
-                    gaps.take(&ran.segments);
+                    gaps.take(&ran.timeline.segments);
+                }
+                if let Some(folder) = pictures {
+                    draw(folder, &format!("{}, {mode}", setting.name), &ran.timeline)?;
                 }
             }
             let told = run(&setting.devices, &tiles, Stealing::On, Stealing::On, HISTORY).await?;
             second_frames_ms.push(told.makespan_ms);
+            if let Some(folder) = pictures {
+                draw(folder, &format!("{}, second frame", setting.name), &told.timeline)?;
+            }
         }
         let medians_ms = makespans_ms.map(|makespans_ms| median(&makespans_ms));
         let jobs_ms: Vec<f64> = tiles.iter().map(|&tile| in_ms(tile)).collect();
@@ -191,7 +199,7 @@ fn unequal_devices(seed: u64) -> Vec<SimDevice> {
 struct Ran {
     /// From the call to the last result.
     makespan_ms: f64,
-    segments: Vec<Segment>,
+    timeline: Timeline,
 }
 
 /// How long devices were idle before jobs that they stole, in milliseconds: from the end of the job before.
@@ -221,6 +229,14 @@ impl Gaps {
     }
 }
 
+/// Writes what a run looked like.
+fn draw(folder: &Path, name: &str, timeline: &Timeline) -> anyhow::Result<()> {
+    let path = folder.join(format!("{}.svg", name.replace(", ", "-").replace(' ', "-")));
+    let written =
+        fs::create_dir_all(folder).and_then(|()| fs::write(&path, svg::picture(&Chart::new(timeline))));
+    written.with_context(|| format!("{} cannot be written", path.display()))
+}
+
 /// Runs the tiles on a fresh farm, under `history` twice: the second time counts.
 async fn run(
     devices: &[SimDevice],
@@ -248,14 +264,13 @@ async fn run(
     }
     let summary = app.run(frame()).await?;
     settled(&farm).await?;
-    let query = TimelineQuery { app: None, task: None, max_segments: usize::MAX };
+    let query = TimelineQuery { app: None, task: None, max_segments: MAX_SEGMENTS };
     let timeline = Admin::new(Some(farm.grpc())).timeline(query).await;
-    let timeline = timeline.map_err(|failure| anyhow::anyhow!(failure.describe()))?;
+    let mut timeline = timeline.map_err(|failure| anyhow::anyhow!(failure.describe()))?;
     app.close().await;
     let last = timeline.segments.iter().map(|segment| segment.job.job.task).max();
-    let segments =
-        timeline.segments.into_iter().filter(|segment| Some(segment.job.job.task) == last).collect();
-    Ok(Ran { makespan_ms: summary.wall_time.as_secs_f64() * 1e3, segments })
+    timeline.segments.retain(|segment| Some(segment.job.job.task) == last);
+    Ok(Ran { makespan_ms: summary.wall_time.as_secs_f64() * 1e3, timeline })
 }
 
 #[cfg(test)]

@@ -74,7 +74,10 @@ pub(crate) async fn run(arguments: &MiArgs, coordinator: Option<&str>) -> Result
         name: "iterations",
     };
     let name = arguments.alignment.file_name().unwrap_or(arguments.alignment.as_os_str());
-    let farm = FarmOptions::new(&address, format!("mi {}", name.to_string_lossy()));
+    let farm = FarmOptions {
+        policy: arguments.policy.clone(),
+        ..FarmOptions::new(&address, format!("mi {}", name.to_string_lossy()))
+    };
     let result = run_graph(farm, graph, arguments.progress, units, &mut stops).await;
     let ended = finish(result, &input, &handle, arguments, before).await;
     if let Some(farm) = own_farm {

@@ -60,6 +60,7 @@ pub(crate) async fn run(arguments: &RenderArgs, coordinator: Option<&str>) -> Re
         name: "samples",
     };
     let mut farm = FarmOptions::new(&address, app_name(&arguments.scene));
+    farm.policy.clone_from(&arguments.policy);
     if own_farm.is_some() {
         // Nobody else will join: a device that does not fit now never will.
         farm.patience = OWN_FARM_PATIENCE;
