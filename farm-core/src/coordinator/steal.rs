@@ -60,6 +60,9 @@ impl StealLatency {
 /// The least gain worth a steal, as a part of the job's finish on the victim: below it the estimates' errors decide.
 const LEAST_GAIN: f64 = 0.2;
 
+/// What is stolen at once should last this many steal latencies on each device.
+const ROUND_LATENCIES: f64 = 4.0;
+
 /// Most steals of one job.
 pub(super) const MAX_STEALS: usize = 3;
 
@@ -285,6 +288,7 @@ impl CoordinatorMachine {
     /// `x = s_t (R - L s_v) / (s_v + s_t)` of 10-scheduling.md for small jobs, and whole jobs on whole devices for large ones.
     fn loot(&self, now: Instant, thief: &Pool<'_>, victim: &Pool<'_>) -> Vec<(JobId, Placement)> {
         let latency_ns = self.steal_latency.ns();
+        let joining = self.nodes.get(&thief.node).is_some_and(|node| node.joining);
         let mut free_at_ns = thief.free_at_ns(now);
         // Time that what was taken so far takes off the victim.
         let mut spared_ns = 0.0;
@@ -300,6 +304,12 @@ impl CoordinatorMachine {
             let soonest =
                 free_at_ns.iter().enumerate().map(finish).min_by(|(_, one), (_, other)| one.total_cmp(other));
             let Some((device, here)) = soonest else { break };
+            // Long jobs are taken one for each device: the next steal comes sooner than these end, and knows more. A node that
+            // joins has one steal of any application's jobs.
+            let rounds = (ROUND_LATENCIES * latency_ns / (here - free_at_ns[device]).max(1.0)).max(1.0);
+            if !joining && jobs.len() as f64 >= rounds * thief.devices.len() as f64 {
+                break;
+            }
             let least = if jobs.is_empty() { (2.0 * latency_ns).max(LEAST_GAIN * there) } else { 0.0 };
             if there - here <= least || jobs.len() == MAX_STOLEN_JOBS {
                 break;
