@@ -13,8 +13,9 @@ pub(crate) struct Payloads {
 }
 
 impl Payloads {
+    /// The first program of an attempt stays: a repetition brings the same one, and nobody else may replace it.
     pub(crate) fn keep_program(&mut self, job: JobAttempt, program: Bytes) {
-        self.programs.insert(job, program);
+        self.programs.entry(job).or_insert(program);
     }
 
     pub(crate) fn program(&self, job: JobAttempt) -> Option<Bytes> {

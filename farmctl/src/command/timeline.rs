@@ -28,7 +28,7 @@ pub(crate) async fn run(
     let text = match arguments.output.unwrap_or_else(|| format.into()) {
         TimelineFormat::Svg => svg::picture(&Chart::new(&timeline)),
         TimelineFormat::Perfetto => serde_json::to_string(&perfetto::trace(&Chart::new(&timeline)))? + "\n",
-        TimelineFormat::Json => serde_json::to_string_pretty(&timeline)? + "\n",
+        TimelineFormat::Json => serde_json::to_string(&timeline)? + "\n",
         TimelineFormat::Table => table(&timeline),
     };
     match &arguments.out {
