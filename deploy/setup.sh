@@ -13,7 +13,11 @@ command -v cc >/dev/null 2>&1 || packages+=(gcc libc6-dev)
 ldconfig -p 2>/dev/null | grep -q 'libvulkan\.so\.1' || packages+=(libvulkan1)
 # Any Vulkan driver will do; Mesa brings lavapipe (Vulkan on the CPU) and those of AMD and Intel GPUs.
 compgen -G '/usr/share/vulkan/icd.d/lvp_icd*.json' >/dev/null || packages+=(mesa-vulkan-drivers)
-[ "${1:-}" != test ] || command -v python3 >/dev/null 2>&1 || packages+=(python3)
+if [ "${1:-}" = test ]; then
+    command -v python3 >/dev/null 2>&1 || packages+=(python3)
+    # The compose test makes its base images where a Docker daemon has none and no registry gives them.
+    ! command -v docker >/dev/null 2>&1 || command -v mmdebstrap >/dev/null 2>&1 || packages+=(mmdebstrap)
+fi
 
 if [ ${#packages[@]} -gt 0 ]; then
     if ! command -v apt-get >/dev/null 2>&1; then
