@@ -18,8 +18,10 @@ const SEEDS: [(&str, &[u64]); 4] = [
     ("storm", &[82, 1_302, 365]),
     // 78: a content that nobody with a link waited for was never asked for again. 165: an application that resumed
     // numbered its batches from zero again, and was expelled for a number it had used. 305: crashes of second attempts
-    // did not count. 2376: a node kept the programs of jobs that it refused.
-    ("weather", &[78, 165, 305, 2_376]),
+    // did not count. 2376: a node kept the programs of jobs that it refused. 5330: contents that could not be had made a
+    // job poison. Of the simulator itself: 10284, 13445, 17727: jobs of applications that were away were held against
+    // idle devices. 18944: a process that had ended took programs in.
+    ("weather", &[78, 165, 305, 2_376, 5_330, 10_284, 13_445, 17_727, 18_944]),
     // 17, 48, 143: an application that resumed without its memory was not told of jobs that had been executed, threw
     // their results away, and waited for them for ever. 218: as 165 of the weather.
     ("lives", &[17, 48, 143, 218]),

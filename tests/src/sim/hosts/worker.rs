@@ -205,6 +205,10 @@ impl WorkerHost {
 
 impl World {
     pub(in crate::sim) fn worker_hears_app(&mut self, index: usize, link: LinkId, message: AppToNode) {
+        // What was on its way to a process that ended reaches nobody.
+        if !self.workers[index].is_up() {
+            return;
+        }
         if let AppToNode::Jobs(tickets) = &message {
             self.workers[index].programs.extend(tickets.iter().map(|ticket| ticket.job));
         }
