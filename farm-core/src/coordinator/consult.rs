@@ -112,7 +112,7 @@ impl CoordinatorMachine {
     fn still_takes(&self, now: Instant, pending: &Pending, node: NodeId, device: DeviceIndex) -> bool {
         let Some(app) = self.apps.get(&pending.app) else { return false };
         let Some(node_state) = self.nodes.get(&node).filter(|node| node.takes_work()) else { return false };
-        let reachable = app.unreachable.get(&node).is_none_or(|until| *until <= now);
+        let reachable = app.can_reach(now, node);
         let device = node_state.devices.get(usize::from(device.0));
         let needs = app.batches.get(&pending.batch).map(|batch| batch.needs);
         reachable

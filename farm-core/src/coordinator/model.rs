@@ -59,6 +59,11 @@ pub(super) struct App {
 }
 
 impl App {
+    /// Whether a node can be reached from the application's machine, as far as is known.
+    pub(super) fn can_reach(&self, now: Instant, node: NodeId) -> bool {
+        self.unreachable.get(&node).is_none_or(|until| *until <= now)
+    }
+
     /// A job that waits in line with its batch. Keys stay in line when their jobs go; this tells them apart.
     pub(super) fn waiting_job(&self, key: JobKey, batch: BatchId) -> Option<&Job> {
         self.jobs.get(&key).filter(|job| job.state == JobState::Waiting && job.batch == batch)

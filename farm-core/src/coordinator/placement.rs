@@ -198,7 +198,7 @@ impl CoordinatorMachine {
     fn candidates(&self, now: Instant, app: &App, batch: &Batch) -> Vec<QuestionDevice> {
         let mut candidates = Vec::new();
         for (&id, node) in self.nodes.iter().filter(|(_, node)| node.takes_work()) {
-            if app.unreachable.get(&id).is_some_and(|until| *until > now) {
+            if !app.can_reach(now, id) {
                 continue;
             }
             let ready_at_ns = node.missing_bytes(&batch.contents) as f64 * FETCH_NS_PER_BYTE;

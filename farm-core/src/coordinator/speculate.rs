@@ -96,8 +96,7 @@ impl CoordinatorMachine {
             let Some(job) = app.jobs.get(&JobKey::of(id)) else { continue };
             let fits =
                 app.batches.get(&job.batch).is_some_and(|batch| batch.needs.fulfilled_by(&device.info));
-            let reachable =
-                app.link.is_some() && app.unreachable.get(&helper).is_none_or(|until| *until <= now);
+            let reachable = app.link.is_some() && app.can_reach(now, helper);
             // What crashed once may be poison: one device at a time.
             let harmless = job.crashes == 0 && job.avoid != Some(helper);
             if !(app.global_stealing && fits && reachable && harmless) {

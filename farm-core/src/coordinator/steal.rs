@@ -495,7 +495,7 @@ fn can_answer(node: &Node) -> bool {
 
 /// Whether the application can send jobs to a node now.
 fn reaches(app: &App, now: Instant, node: NodeId) -> bool {
-    app.link.is_some() && app.unreachable.get(&node).is_none_or(|until| *until <= now)
+    app.link.is_some() && app.can_reach(now, node)
 }
 
 /// The devices of a kind that fulfil a job's needs.
