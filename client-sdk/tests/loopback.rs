@@ -500,3 +500,18 @@ async fn a_node_that_joins_takes_over_queued_jobs() {
     app.close().await;
     farm.stop().await;
 }
+
+/// The refusal and the end of the session often come in one piece; the reason must win every time.
+#[tokio::test]
+async fn an_application_that_is_refused_hears_why() {
+    let farm = TestFarm::start(0, &[]).await;
+    for _ in 0..50 {
+        let options = FarmOptions { policy: "nonesuch".to_owned(), ..farm.options() };
+        let refused = Farm::connect(options).await.expect_err("there is no such policy");
+        assert!(
+            matches!(&refused, FarmError::Refused { reason, .. } if reason.contains("nonesuch")),
+            "{refused}"
+        );
+    }
+    farm.stop().await;
+}

@@ -262,6 +262,8 @@ impl Driver {
                 }
             }
             Input::CoordinatorEnded { serial, error } => {
+                // What was said before the end comes first: a refusal is the reason of the end.
+                self.carry_out();
                 if self.coordinator.is_current(serial) {
                     self.coordinator_lost(error);
                 }
