@@ -117,6 +117,15 @@ pub struct DeviceInfo {
     pub limits: Limits,
 }
 
+impl DeviceInfo {
+    /// Whether a job planned for `other` may run here: the same kind, and nothing that `other` has is lacking. The node
+    /// does not know what the job itself needs.
+    #[must_use]
+    pub fn stands_in_for(&self, other: &Self) -> bool {
+        self.kind == other.kind && self.features.contains(other.features) && self.limits.cover(&other.limits)
+    }
+}
+
 /// What a job needs of a device.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Requirements {

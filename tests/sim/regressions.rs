@@ -20,8 +20,16 @@ const SEEDS: [(&str, &[u64]); 4] = [
     // numbered its batches from zero again, and was expelled for a number it had used. 305: crashes of second attempts
     // did not count. 2376: a node kept the programs of jobs that it refused. 5330: contents that could not be had made a
     // job poison. Of the simulator itself: 10284, 13445, 17727: jobs of applications that were away were held against
-    // idle devices. 18944: a process that had ended took programs in.
-    ("weather", &[78, 165, 305, 2_376, 5_330, 10_284, 13_445, 17_727, 18_944]),
+    // idle devices. 18944: a process that had ended took programs in. 6521: what a node moved off a lost device was not
+    // seen by thieves. 47121, 68965, 71353, 73278: contents out of reach for two seconds failed their jobs. Of the simulator:
+    // 35007, 47627: a job that was planned anew after its end was said to be stolen too often.
+    (
+        "weather",
+        &[
+            78, 165, 305, 2_376, 5_330, 6_521, 10_284, 13_445, 17_727, 18_944, 35_007, 47_121, 47_627,
+            68_965, 71_353, 73_278,
+        ],
+    ),
     // 17, 48, 143: an application that resumed without its memory was not told of jobs that had been executed, threw
     // their results away, and waited for them for ever. 218: as 165 of the weather.
     ("lives", &[17, 48, 143, 218]),

@@ -422,7 +422,7 @@ impl CoordinatorMachine {
                 self.timeline.report_came(now, node, sent_at);
                 self.reported(now, node, executed, &delivered)
             }
-            NodeToCoordinator::DeviceLost { device, reason } => self.device_lost(node, device, &reason),
+            NodeToCoordinator::DeviceLost { device, reason } => self.device_lost(now, node, device, &reason),
             NodeToCoordinator::Retracted { steal, retracted, running, unknown } => {
                 tracing::debug!(%steal, %node, kept = running.len(), unknown = unknown.len(), "retracted");
                 self.retracted(now, node, steal, &retracted);

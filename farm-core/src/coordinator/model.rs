@@ -92,8 +92,9 @@ pub(super) struct Job {
     pub(super) state: JobState,
     /// Attempts that ended with their device or node.
     pub(super) crashes: u32,
-    /// Attempts that ended because a node could not get its contents.
+    /// Attempts that ended because a node could not get its contents, and when the first did.
     pub(super) starved: u32,
+    pub(super) starved_since: Option<Instant>,
     /// The node that lost it last: another one is preferred.
     pub(super) avoid: Option<NodeId>,
     /// Nodes it was stolen from, in order: it is never stolen back.
@@ -216,6 +217,21 @@ impl Node {
 
     pub(super) fn device_mut(&mut self, device: DeviceIndex) -> Option<&mut Device> {
         self.devices.get_mut(usize::from(device.0))
+    }
+
+    /// The device that will be free first of those that can take the jobs of a lost one.
+    pub(super) fn sibling_of(
+        &self,
+        now: Instant,
+        lost: DeviceIndex,
+        modules: &Modules,
+    ) -> Option<DeviceIndex> {
+        let lost = &self.devices.get(usize::from(lost.0))?.info;
+        let siblings = (0_u16..).zip(&self.devices);
+        let standing = siblings.filter(|(_, device)| !device.lost && device.info.stands_in_for(lost));
+        let free_at = |device: &Device| device.free_at_ns(now, modules);
+        let first = standing.min_by(|(_, one), (_, other)| free_at(one).total_cmp(&free_at(other)));
+        first.map(|(index, _)| DeviceIndex(index))
     }
 }
 

@@ -295,7 +295,11 @@ impl CoordinatorMachine {
         plans
     }
 
-    fn node_plan(&self, id: NodeId, devices: BTreeMap<DeviceIndex, Vec<JobAttempt>>) -> Option<NodePlan> {
+    pub(super) fn node_plan(
+        &self,
+        id: NodeId,
+        devices: BTreeMap<DeviceIndex, Vec<JobAttempt>>,
+    ) -> Option<NodePlan> {
         let node = self.nodes.get(&id)?;
         let devices = devices.into_iter().map(|(device, jobs)| DevicePlan { device, jobs }).collect();
         Some(NodePlan { node: id, session: node.session, contact: node.contact.clone(), devices })
@@ -376,6 +380,7 @@ fn take_in(app: &mut App, request: &PlanRequest, module: Module) -> Intake {
                     state: JobState::Waiting,
                     crashes: 0,
                     starved: 0,
+                    starved_since: None,
                     avoid: None,
                     stolen_from: Vec::new(),
                 };

@@ -258,6 +258,7 @@ impl CoordinatorMachine {
         self.welcome_app(now, id);
         self.repeat_failures(id);
         self.repeat_placements(id);
+        self.repeat_backups(id);
         self.retry_stuck();
     }
 

@@ -21,8 +21,11 @@ const UNREACHABLE_MS: u64 = 60_000;
 /// Most failures of one application that are remembered for repetition; beyond it the smallest ids are forgotten.
 const MAX_REMEMBERED_FAILURES: usize = 4_096;
 
-/// Attempts of one job that may end because a node could not get its contents; each of them is three tries of that node.
+/// A job fails by its contents after so many attempts in which a node could not get them (three tries each)…
 const MAX_STARVED: u32 = 8;
+
+/// … and no sooner than this after the first: a network that is down for some seconds costs no job.
+const STARVED_PATIENCE: Duration = Duration::from_secs(30);
 
 /// On each device a node runs one job and has staged one: only these can have brought it down.
 const SUSPECT_JOBS_PER_DEVICE: usize = 2;
@@ -234,10 +237,11 @@ impl CoordinatorMachine {
     }
 
     /// A node could not get what a job needs: no executor crashed, but it cannot go on for ever.
-    pub(super) fn starved(&mut self, id: JobId, content: ContentHash, node: NodeId) {
+    pub(super) fn starved(&mut self, now: Instant, id: JobId, content: ContentHash, node: NodeId) {
         let Some(job) = self.job_mut(id) else { return };
         job.starved = job.starved.saturating_add(1);
-        if job.starved >= MAX_STARVED {
+        let since = *job.starved_since.get_or_insert(now);
+        if job.starved >= MAX_STARVED && now.since(since) >= STARVED_PATIENCE {
             self.fail_job(id, JobFailure::ContentUnavailable(content));
         } else {
             self.requeue(id, Some(node));

@@ -2,9 +2,14 @@
 
 use std::time::Duration;
 
-use super::{CoordinatorMachine, model::JobState, policy::Policy, rates::Load};
+use super::{
+    CoordinatorMachine,
+    model::{JobState, Placement},
+    policy::Policy,
+    rates::Load,
+};
 use crate::{
-    id::{DeviceIndex, JobAttempt, JobId, NodeId},
+    id::{DeviceIndex, JobAttempt, JobId, JobKey, NodeId},
     message::{CoordinatorToNode, DeviceLoad, Executed, JobFailure},
     time::Instant,
 };
@@ -35,12 +40,37 @@ impl CoordinatorMachine {
         }
     }
 
-    pub(super) fn device_lost(&mut self, id: NodeId, device: DeviceIndex, reason: &str) {
-        tracing::warn!(node = %id, %device, reason, "device lost");
+    /// Its node moves what was queued there to devices that stand in for it, and gives it back where there is none.
+    pub(super) fn device_lost(&mut self, now: Instant, id: NodeId, index: DeviceIndex, reason: &str) {
+        tracing::warn!(node = %id, device = %index, reason, "device lost");
         let Some(node) = self.nodes.get_mut(&id) else { return };
-        if let Some(device) = node.device_mut(device) {
-            device.lost = true;
-            device.running = None;
+        let Some(device) = node.device_mut(index) else { return };
+        device.lost = true;
+        device.running = None;
+        for job in node.jobs.iter().copied().collect::<Vec<_>>() {
+            self.follow_to_sibling(now, id, index, job);
+        }
+    }
+
+    /// Books a job of a lost device on a sibling, as its node does. Which one the node took shows when it ran.
+    fn follow_to_sibling(&mut self, now: Instant, id: NodeId, lost: DeviceIndex, job: JobId) {
+        let is_here = |place: &&mut Placement| place.node == id && place.device == lost;
+        let app = self.apps.get_mut(&job.app);
+        let first = app.and_then(|app| app.jobs.get_mut(&JobKey::of(job))).map(|job| &mut job.state);
+        let first =
+            first.and_then(|state| if let JobState::Placed(place) = state { Some(place) } else { None });
+        let Some(place) = first.filter(is_here).or_else(|| self.backups.get_mut(&job).filter(is_here)) else {
+            return;
+        };
+        let Some(node) = self.nodes.get_mut(&id) else { return };
+        let Some(sibling) = node.sibling_of(now, lost, &self.modules) else { return };
+        place.device = sibling;
+        let load = place.load;
+        if let Some(device) = node.device_mut(lost) {
+            device.drop_load(load);
+        }
+        if let Some(device) = node.device_mut(sibling) {
+            device.add_load(now, load);
         }
     }
 
@@ -72,7 +102,7 @@ impl CoordinatorMachine {
                 }
                 self.requeue(id, Some(node));
             }
-            Some(JobFailure::ContentUnavailable(content)) => self.starved(id, content, node),
+            Some(JobFailure::ContentUnavailable(content)) => self.starved(now, id, content, node),
             Some(failure) if failure.can_be_retried() => self.crashed(id, failure, node),
             // Its application gets this failure from the node, as a result; nothing else is owed.
             Some(_) => {

@@ -4,13 +4,15 @@
 //! It is the only defence against a node that computes far slower than anybody knows. Backups stand beside
 //! [`JobState`], which names the attempt that goes on if both are lost.
 
+use std::collections::BTreeMap;
+
 use super::{
     CoordinatorMachine,
     model::{JobState, Placement},
 };
 use crate::{
     id::{AppId, Attempt, DeviceIndex, JobAttempt, JobId, JobKey, NodeId},
-    message::{CoordinatorToApp, CoordinatorToNode, DevicePlan, NodePlan, Plan},
+    message::{CoordinatorToApp, CoordinatorToNode, Plan},
     time::Instant,
 };
 
@@ -152,19 +154,28 @@ impl CoordinatorMachine {
         if let Some(device) = node.device_mut(device) {
             device.add_load(now, place.load);
         }
-        let plan = NodePlan {
-            node: helper,
-            session: node.session,
-            contact: node.contact.clone(),
-            devices: vec![DevicePlan { device, jobs: vec![JobAttempt { job: id, attempt }] }],
-        };
         self.backups.insert(id, place);
         self.speculations += 1;
         tracing::info!(job = %id, from = %straggler.place.node, to = %helper, "second attempt at the tail");
+        self.say_backup(id);
+    }
+
+    fn say_backup(&mut self, id: JobId) {
+        let Some(place) = self.backups.get(&id) else { return };
+        let job = JobAttempt { job: id, attempt: place.attempt };
+        let Some(plan) = self.node_plan(place.node, BTreeMap::from([(place.device, vec![job])])) else {
+            return;
+        };
         self.tell_app(
             id.app,
             CoordinatorToApp::Plan(Plan { batch: None, speculative: true, nodes: vec![plan] }),
         );
+    }
+
+    /// Says again which second attempts an application has.
+    pub(super) fn repeat_backups(&mut self, app: AppId) {
+        let of_app: Vec<JobId> = self.backups.keys().filter(|job| job.app == app).copied().collect();
+        of_app.into_iter().for_each(|job| self.say_backup(job));
     }
 }
 

@@ -78,13 +78,9 @@ impl Device {
         &self.queues
     }
 
-    /// Whether a job planned for `other` may run here: the same kind, and nothing that `other` has is lacking. What the
-    /// job itself needs is not on its ticket.
+    /// Whether a job planned for `other` may run here.
     pub(super) fn stands_in_for(&self, other: &Self) -> bool {
-        !self.lost
-            && self.info.kind == other.info.kind
-            && self.info.features.contains(other.info.features)
-            && self.info.limits.cover(&other.info.limits)
+        !self.lost && self.info.stands_in_for(&other.info)
     }
 
     /// Work in the queue, in nanoseconds at speed 1.0.

@@ -1,4 +1,4 @@
-//! A coordinator with one application and nodes of one device each, driven by hand.
+//! A coordinator with one application and its nodes, driven by hand.
 
 use std::{collections::BTreeMap, time::Duration};
 
@@ -8,7 +8,10 @@ use farm_core::{
         policy::{Question, QuestionId},
     },
     device::{DeviceInfo, DeviceKind, Features, Limits, Requirements},
-    id::{BatchId, ContentHash, DeviceIndex, Epoch, JobAttempt, JobIndex, LinkId, NodeSession, TaskId},
+    id::{
+        AppIncarnation, BatchId, ContentHash, DeviceIndex, Epoch, JobAttempt, JobIndex, LinkId, NodeSession,
+        TaskId,
+    },
     message::{
         AppHello, AppToCoordinator, Contact, CoordinatorToApp, CoordinatorToNode, CostNs, DeviceLoad,
         Executed, JobFailure, JobTrace, NodeHello, NodeToCoordinator, PROTOCOL_VERSION, Plan, PlanJob,
@@ -21,7 +24,7 @@ use farm_core::{
 const APP: LinkId = LinkId(0);
 pub(crate) const MILLISECOND_NS: u64 = 1_000_000;
 
-/// A coordinator with one application and nodes of one device each, driven by hand.
+/// A coordinator with one application and nodes of one device each unless said otherwise.
 pub(crate) struct Farm {
     pub(crate) machine: CoordinatorMachine,
     pub(crate) now: Instant,
@@ -53,20 +56,23 @@ impl Farm {
         for (node, &score) in (1..).zip(scores) {
             farm.node_joins(node, score);
         }
-        let hello = AppHello {
-            protocol: PROTOCOL_VERSION,
-            name: "app".to_owned(),
-            weight: 1.0,
-            global_stealing: true,
-            policy: policy.to_owned(),
-            resume: None,
-        };
-        farm.say(AppToCoordinator::Hello(hello));
+        farm.say(AppToCoordinator::Hello(AppHello { policy: policy.to_owned(), ..hello() }));
         farm
     }
 
+    /// The application dials again.
+    pub(crate) fn app_comes_back(&mut self) -> BTreeMap<u64, Vec<JobAttempt>> {
+        let resume = Some((self.machine.status().apps[0].app, AppIncarnation(1)));
+        let message = AppToCoordinator::Hello(AppHello { resume, ..hello() });
+        self.handle(Event::FromApp { link: LinkId(1_000), message })
+    }
+
     pub(crate) fn node_joins(&mut self, node: u64, score: f64) {
-        let info = DeviceInfo {
+        self.node_of_devices_joins(node, &[score]);
+    }
+
+    pub(crate) fn node_of_devices_joins(&mut self, node: u64, scores: &[f64]) {
+        let device = |&score: &f64| DeviceInfo {
             name: "sim".to_owned(),
             kind: DeviceKind::Simulated,
             score,
@@ -77,7 +83,7 @@ impl Farm {
             protocol: PROTOCOL_VERSION,
             name: format!("node {node}"),
             session: NodeSession(node),
-            devices: vec![info],
+            devices: scores.iter().map(device).collect(),
             contact: Contact { addresses: Vec::new(), certificate_der: Vec::new() },
             inventory: Vec::new(),
         });
@@ -230,6 +236,17 @@ impl Farm {
             self.now = self.now.after(Duration::from_nanos(device_time_ns));
             self.report(node, job, device_time_ns, None);
         }
+    }
+}
+
+fn hello() -> AppHello {
+    AppHello {
+        protocol: PROTOCOL_VERSION,
+        name: "app".to_owned(),
+        weight: 1.0,
+        global_stealing: true,
+        policy: String::new(),
+        resume: None,
     }
 }
 

@@ -4,5 +4,6 @@
 
 mod farm;
 mod guard;
+mod losses;
 mod policies;
 mod speculation;

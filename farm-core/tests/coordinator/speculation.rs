@@ -101,3 +101,15 @@ fn when_both_attempts_are_lost_a_third_one_follows() {
     assert_eq!(count(&planned, 3), 1, "on the node that is left");
     farm.now = farm.now.after(Duration::from_millis(1));
 }
+
+#[test]
+fn an_application_that_comes_back_hears_of_second_attempts() {
+    let (mut farm, first) = tail();
+    let second = backup(&mut farm, first);
+    let told = farm.app_comes_back();
+    assert_eq!(
+        (told.get(&1), told.get(&2)),
+        (Some(&vec![first]), Some(&vec![second])),
+        "or its result is lost"
+    );
+}

@@ -259,7 +259,12 @@ impl Auditor {
 
     /// A job is over for its application.
     pub(super) fn ends(&mut self, job: JobId, ending: &Ending, max_crashes: u32) {
-        self.over += usize::from(self.jobs.contains_key(&job));
+        if let Some(record) = self.jobs.get_mut(&job) {
+            self.over += 1;
+            // A plan request repeated meanwhile has the coordinator plan it anew, as a job that was never stolen.
+            record.steals = 0;
+            record.left.clear();
+        }
         if let Ending::Failed(JobFailure::Poison(reason)) = ending {
             let crashes = self.jobs.get(&job).map_or(0, |record| record.crashes);
             // Each loss of a worker it was on can have been held against it, once for its own crash there.
