@@ -297,11 +297,17 @@ impl Device {
         self.planned_jobs -= 1;
     }
 
-    /// Counts one completed job, and learns from it.
-    pub(super) fn completed(&mut self, now: Instant, modules: &mut Modules, load: Load, device_time_ns: u64) {
+    /// Counts one completed job, and learns from it what such jobs cost, in points of score times nanoseconds.
+    pub(super) fn completed(
+        &mut self,
+        now: Instant,
+        modules: &mut Modules,
+        load: Load,
+        device_time_ns: u64,
+    ) -> f64 {
         self.busy_since = now;
         self.executed_jobs += 1;
         self.device_time_ns = self.device_time_ns.saturating_add(device_time_ns);
-        self.throughput.completed(modules, load, device_time_ns);
+        self.throughput.completed(modules, load, device_time_ns)
     }
 }

@@ -188,13 +188,14 @@ pub(super) struct History {
 
 #[derive(Debug, Default)]
 struct Past {
-    work: Vec<f32>,
+    /// Of each job, in points of score times nanoseconds: neither the device nor the scale of its module shows.
+    point_ns: Vec<f32>,
     last_note: u64,
 }
 
 impl History {
     #[expect(clippy::cast_possible_truncation, reason = "seven digits are more than a hint needs")]
-    pub(super) fn note(&mut self, app: &str, index: JobIndex, work: f64) {
+    pub(super) fn note(&mut self, app: &str, index: JobIndex, point_ns: f64) {
         let Some(index) = usize::try_from(index.0).ok().filter(|index| *index < MAX_HISTORY_JOBS) else {
             return;
         };
@@ -210,19 +211,19 @@ impl History {
         }
         let Some(past) = self.by_name.get_mut(app) else { return };
         past.last_note = self.notes;
-        if past.work.len() <= index {
-            past.work.resize(index + 1, 0.0);
+        if past.point_ns.len() <= index {
+            past.point_ns.resize(index + 1, 0.0);
         }
-        past.work[index] = work as f32;
+        past.point_ns[index] = point_ns as f32;
     }
 
     /// Puts what is known in the place of what was estimated (temporal coherence: thesis 5.6.3, of fly-throughs).
-    pub(super) fn recall(&self, app: &str, jobs: &mut [QuestionJob]) {
+    pub(super) fn recall(&self, app: &str, load: impl Fn(f64) -> f64, jobs: &mut [QuestionJob]) {
         let Some(past) = self.by_name.get(app) else { return };
         for job in jobs {
-            let known = usize::try_from(job.index.0).ok().and_then(|index| past.work.get(index));
-            if let Some(&work) = known.filter(|work| **work > 0.0) {
-                job.load = work.into();
+            let known = usize::try_from(job.index.0).ok().and_then(|index| past.point_ns.get(index));
+            if let Some(&point_ns) = known.filter(|point_ns| **point_ns > 0.0) {
+                job.load = load(point_ns.into());
             }
         }
     }

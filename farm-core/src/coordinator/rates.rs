@@ -1,6 +1,10 @@
 //! What devices are worth: a rate for each (module, device), learnt from completed jobs, and for pairs without a
 //! completed job an estimate from the device's score (10-scheduling.md section 1).
 //!
+//! A rate is `score * speed * scale`: the device's score, how much faster than its score says it is at the module, and what
+//! a point of score is worth at the module just now, which all devices tell together. Where nobody knows what jobs cost, dear
+//! jobs in a row lower the scale, which all devices share, and no device's speed.
+//!
 //! Loads are in the unit of their module's applications (nanoseconds at speed 1.0 where they give costs), so rates of two
 //! modules are never compared: only the times that follow from them are.
 
@@ -8,14 +12,19 @@ use std::collections::BTreeMap;
 
 use crate::id::ContentHash;
 
-/// Least weight of a new throughput sample in a rate; the first samples weigh alike. Where applications do not know what
-/// their jobs cost, samples scatter like the jobs (by a fifth in a render): at 0.05 a rate scatters by 3 %, and a change of speed
+/// Least weight of a new throughput sample in a mean; the first samples weigh alike. Where applications do not know what
+/// their jobs cost, samples scatter like the jobs (by a fifth in a render): at 0.05 a mean scatters by 3 %, and a change of speed
 /// is followed within forty jobs.
 const LEAST_RATE_GAIN: f64 = 0.05;
 
 /// A sample counts as at most this many times faster or slower than the rate so far: one warm-up launch or one job of
 /// wrong cost must not starve or flood a device.
 const MAX_RATE_STEP: f64 = 16.0;
+
+/// After so many samples in a row that are off by more than this factor, all to the same side, a mean starts anew: the same
+/// module has jobs of another size now, or a device another speed.
+const FAR_OFF: f64 = 2.0;
+const CHANGED_AFTER: i8 = 4;
 
 /// Most modules with a scale of their own; beyond it the one that was asked for longest ago is forgotten.
 const MAX_MODULES: usize = 1_024;
@@ -81,6 +90,11 @@ impl Modules {
         self.entries.get(&module).is_some_and(|entry| entry.scale.value.is_some())
     }
 
+    /// The load, in the module's unit of now, of a job that cost so many points of score times nanoseconds.
+    pub(super) fn load(&self, module: Module, point_ns: f64) -> f64 {
+        point_ns * self.scale(module)
+    }
+
     /// Load per time that a point of score stands for.
     fn scale(&self, module: Module) -> f64 {
         let own = self.entries.get(&module).and_then(|entry| entry.scale.value);
@@ -99,8 +113,8 @@ impl Modules {
 #[derive(Debug)]
 pub(super) struct Throughput {
     score: f64,
-    /// How much faster than its score says, compared with the others.
-    bias: Mean,
+    /// How much faster than its score says, compared with the others: over all modules, the guess for a new one.
+    speed: Mean,
     /// Few: searched from the front.
     modules: Vec<ModuleThroughput>,
 }
@@ -108,20 +122,26 @@ pub(super) struct Throughput {
 #[derive(Debug)]
 struct ModuleThroughput {
     module: Module,
-    rate: Mean,
+    /// How much faster than its score says the device is at this module.
+    speed: Mean,
     queued: u128,
     jobs: u64,
 }
 
 impl Throughput {
     pub(super) const fn new(score: f64) -> Self {
-        Self { score, bias: Mean::NONE, modules: Vec::new() }
+        Self { score, speed: Mean::NONE, modules: Vec::new() }
     }
 
     /// Load of a module per nanosecond.
     pub(super) fn rate(&self, modules: &Modules, module: Module) -> f64 {
-        let measured = self.find(module).and_then(|found| found.rate.value);
-        measured.unwrap_or_else(|| self.points() * modules.scale(module))
+        self.points(module) * modules.scale(module)
+    }
+
+    /// What the device's score should be for jobs of a module.
+    fn points(&self, module: Module) -> f64 {
+        let own = self.find(module).and_then(|found| found.speed.value);
+        self.score * own.or(self.speed.value).unwrap_or(1.0)
     }
 
     /// How long what is queued takes, in nanoseconds.
@@ -142,7 +162,7 @@ impl Throughput {
                 self.forget_idle();
                 self.modules.push(ModuleThroughput {
                     module: load.module,
-                    rate: Mean::NONE,
+                    speed: Mean::NONE,
                     queued: 0,
                     jobs: 0,
                 });
@@ -160,23 +180,22 @@ impl Throughput {
         found.jobs -= 1;
     }
 
-    /// Learns from one completed job.
-    pub(super) fn completed(&mut self, modules: &mut Modules, load: Load, device_time_ns: u64) {
-        if load.amount == 0 || device_time_ns == 0 {
-            return;
+    /// Learns from one completed job. Gives what it cost, in points of score times nanoseconds, which no change of the
+    /// scale changes; see [`Modules::load`].
+    pub(super) fn completed(&mut self, modules: &mut Modules, load: Load, device_time_ns: u64) -> f64 {
+        let Load { module, amount } = load;
+        if amount > 0 && device_time_ns > 0 {
+            let sample = amount as f64 / device_time_ns as f64;
+            modules.observe(module, sample / self.points(module));
+            let speed = sample / (self.score * modules.scale(module));
+            self.speed.observe(speed);
+            let presumed = self.speed;
+            if let Some(found) = self.modules.iter_mut().find(|found| found.module == module) {
+                found.speed.presume(presumed);
+                found.speed.observe(speed);
+            }
         }
-        let sample = load.amount as f64 / device_time_ns as f64;
-        modules.observe(load.module, sample / self.points());
-        self.bias.observe(sample / (self.score * modules.scale(load.module)));
-        let prior = self.points() * modules.scale(load.module);
-        if let Some(found) = self.modules.iter_mut().find(|found| found.module == load.module) {
-            found.rate.presume(prior);
-            found.rate.observe(sample);
-        }
-    }
-
-    fn points(&self) -> f64 {
-        self.score * self.bias.value.unwrap_or(1.0)
+        self.points(module) * device_time_ns as f64
     }
 
     fn find(&self, module: Module) -> Option<&ModuleThroughput> {
@@ -192,32 +211,40 @@ impl Throughput {
     }
 }
 
-/// A mean of positive samples that forgets the older ones; `None` before the first.
+/// A mean of positive samples that forgets the older ones; `None` before the first. It starts anew when several samples in
+/// a row say that what is measured has changed.
 #[derive(Clone, Copy, Debug, Default)]
 struct Mean {
     value: Option<f64>,
     samples: u32,
+    /// Samples in a row that were far off, negative where they were smaller.
+    off_in_a_row: i8,
 }
 
 impl Mean {
-    const NONE: Self = Self { value: None, samples: 0 };
+    const NONE: Self = Self { value: None, samples: 0, off_in_a_row: 0 };
 
     /// Something to begin with, which counts as one sample.
-    fn presume(&mut self, value: f64) {
+    const fn presume(&mut self, other: Self) {
         if self.value.is_none() {
-            *self = Self { value: Some(value), samples: 1 };
+            *self = Self { samples: 1, ..other };
         }
     }
 
     fn observe(&mut self, sample: f64) {
+        let so_far = self.value.unwrap_or(sample);
+        self.off_in_a_row = match sample / so_far {
+            part if part > FAR_OFF => self.off_in_a_row.max(0) + 1,
+            part if part < 1.0 / FAR_OFF => self.off_in_a_row.min(0) - 1,
+            _ => 0,
+        };
+        if self.off_in_a_row.abs() == CHANGED_AFTER {
+            *self = Self { value: Some(sample), samples: 1, off_in_a_row: 0 };
+            return;
+        }
         self.samples = self.samples.saturating_add(1);
-        self.value = Some(match self.value {
-            None => sample,
-            Some(so_far) => {
-                let sample = sample.clamp(so_far / MAX_RATE_STEP, so_far * MAX_RATE_STEP);
-                let gain = (1.0 / f64::from(self.samples)).max(LEAST_RATE_GAIN);
-                so_far + gain * (sample - so_far)
-            }
-        });
+        let sample = sample.clamp(so_far / MAX_RATE_STEP, so_far * MAX_RATE_STEP);
+        let gain = (1.0 / f64::from(self.samples)).max(LEAST_RATE_GAIN);
+        self.value = Some(so_far + gain * (sample - so_far));
     }
 }

@@ -153,12 +153,11 @@ impl CoordinatorMachine {
         device_time_ns: u64,
     ) {
         let Some(device) = self.nodes.get_mut(&id).and_then(|node| node.device_mut(device)) else { return };
-        device.completed(now, &mut self.modules, load, device_time_ns);
-        let work = device.throughput.rate(&self.modules, load.module) * device_time_ns as f64;
+        let point_ns = device.completed(now, &mut self.modules, load, device_time_ns);
         let Some(app) = self.apps.get_mut(&job.app) else { return };
         app.device_time_ns = app.device_time_ns.saturating_add(device_time_ns);
         if app.policy == Policy::History {
-            self.history.note(&app.name, job.index, work);
+            self.history.note(&app.name, job.index, point_ns);
         }
     }
 

@@ -229,6 +229,11 @@ impl Farm {
         self.handle(Event::FromNode { link: LinkId(node), message })
     }
 
+    /// A node has executed and delivered a job just now, in so many milliseconds.
+    pub(crate) fn ended(&mut self, node: u64, job: JobAttempt, took_ms: u64) {
+        self.report(node, job, took_ms * MILLISECOND_NS, None);
+    }
+
     /// A node has executed and delivered jobs, each in the time that `took_ms` says.
     pub(crate) fn done(&mut self, node: u64, jobs: &[JobAttempt], took_ms: impl Fn(JobAttempt) -> u64) {
         for &job in jobs {

@@ -1,11 +1,11 @@
 //! Which device a job goes to: rates per module, data that is there, and the policies an application may choose.
 
-use std::time::Duration;
+use std::{collections::BTreeMap, time::Duration};
 
 use farm_core::id::LinkId;
 use farm_core::{
     coordinator::{Event, policy::Choice},
-    id::{ContentHash, JobAttempt},
+    id::{ContentHash, JobAttempt, JobIndex},
     message::NodeToCoordinator,
     program::Content,
 };
@@ -152,4 +152,43 @@ fn a_device_that_went_while_a_plug_in_thought_takes_nothing() {
     assert_eq!(asked.devices.len(), 1, "of the farm as it is");
     let answer = Ok([0, 1].map(|job| Choice { job, device: 0 }).to_vec());
     assert_eq!(count(&farm.handle(Event::PolicyAnswered { question, answer }), 2), 2);
+}
+
+/// Runs what was planned, each node its jobs in order, and reports ends as they come; gives what each node was busy.
+fn run(
+    farm: &mut Farm,
+    planned: &BTreeMap<u64, Vec<JobAttempt>>,
+    took_ms: impl Fn(JobIndex) -> u64,
+) -> Vec<u64> {
+    let mut ends: Vec<(u64, u64, JobAttempt, u64)> = Vec::new();
+    let mut busy = Vec::new();
+    for (&node, jobs) in planned {
+        let mut at = 0;
+        for &job in jobs {
+            let took = took_ms(job.job.index);
+            at += took;
+            ends.push((at, node, job, took));
+        }
+        busy.push(at);
+    }
+    ends.sort_unstable_by_key(|(at, ..)| *at);
+    let began = farm.now;
+    for (at, node, job, took) in ends {
+        farm.now = began.after(Duration::from_millis(at));
+        farm.ended(node, job, took);
+    }
+    busy
+}
+
+#[test]
+fn the_second_frame_is_spread_by_what_the_first_one_took() {
+    // Dear tiles lie together, as in an image; nobody knows before.
+    let took_ms = |index: JobIndex| 40 + 40 * u64::from((100..260).contains(&index.0));
+    let mut farm = Farm::new("history", &[1_000.0; 32]);
+    let planned = farm.plan(&[0; 540], 1, &[]);
+    run(&mut farm, &planned, took_ms);
+    let planned = farm.plan(&[0; 540], 1, &[]);
+    let busy = run(&mut farm, &planned, took_ms);
+    let (least, most) = (busy.iter().min().unwrap(), busy.iter().max().unwrap());
+    assert!(most - least <= 40, "devices end within a cheap tile of each other: {busy:?}");
 }

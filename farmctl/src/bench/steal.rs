@@ -237,7 +237,7 @@ fn draw(folder: &Path, name: &str, timeline: &Timeline) -> anyhow::Result<()> {
     written.with_context(|| format!("{} cannot be written", path.display()))
 }
 
-/// Runs the tiles on a fresh farm, under `history` twice: the second time counts.
+/// Runs the tiles on a fresh farm, after jobs that take no time; under `history` after a first frame of the same tiles.
 async fn run(
     devices: &[SimDevice],
     tiles: &[CostNs],
@@ -254,14 +254,13 @@ async fn run(
         ..FarmOptions::new(farm.grpc(), "bench steal")
     };
     let app = Farm::connect(options).await?;
-    let warm_up = List::new(vec![CostNs(0); WARM_UP_JOBS], UNKNOWN);
-    app.run(TaskGraph::new().task("warm up", warm_up)).await?;
-    settled(&farm).await?;
     let frame = || TaskGraph::new().task("tiles", List::new(tiles.to_vec(), UNKNOWN));
-    if policy == HISTORY {
-        app.run(frame()).await?;
-        settled(&farm).await?;
-    }
+    let before = match policy {
+        HISTORY => frame(),
+        _ => TaskGraph::new().task("warm up", List::new(vec![CostNs(0); WARM_UP_JOBS], UNKNOWN)),
+    };
+    app.run(before).await?;
+    settled(&farm).await?;
     let summary = app.run(frame()).await?;
     settled(&farm).await?;
     let query = TimelineQuery { app: None, task: None, max_segments: MAX_SEGMENTS };
