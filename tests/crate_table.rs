@@ -47,7 +47,8 @@ const OURS: [(&str, &[&str]); 10] = [
 ];
 
 /// Our crates that may name what the table keeps in one place; everyone else may not.
-const RESTRICTED: [(&str, &[&str]); 12] = [
+const RESTRICTED: [(&str, &[&str]); 13] = [
+    ("libloading", &["coordinator"]),
     ("wgpu", &["gpu-exec"]),
     ("naga", &["gpu-exec"]),
     ("bincode", &["proto"]),
