@@ -6,19 +6,45 @@
 var<workgroup> histogram: array<u32, SYMBOLS * 128u>;
 var<workgroup> group_maximum: atomic<u32>;
 
+// The first and the third column have words of their own, so have the others: two sums are under way at a time.
 fn count_row(symbols: u32, lane: u32) {
     let a = (symbols & 0xffu) * 128u + lane;
-    histogram[a] += 1u;
-    let b = ((symbols >> 8u) & 0xffu) * 128u + lane;
-    histogram[b] += 0x10000u;
     let c = ((symbols >> 16u) & 0xffu) * 128u + 64u + lane;
-    histogram[c] += 1u;
+    let count_a = histogram[a];
+    let count_c = histogram[c];
+    histogram[a] = count_a + 1u;
+    histogram[c] = count_c + 1u;
+    let b = ((symbols >> 8u) & 0xffu) * 128u + lane;
     let d = (symbols >> 24u) * 128u + 64u + lane;
-    histogram[d] += 0x10000u;
+    let count_b = histogram[b];
+    let count_d = histogram[d];
+    histogram[b] = count_b + 0x10000u;
+    histogram[d] = count_d + 0x10000u;
+}
+
+fn count_rows(symbols: vec4<u32>, lane: u32) {
+    count_row(symbols.x, lane);
+    count_row(symbols.y, lane);
+    count_row(symbols.z, lane);
+    count_row(symbols.w, lane);
 }
 
 fn grouped_row(base: u32, place: u32) -> u32 {
     return (grouped[base + (place >> 1u)] >> ((place & 1u) * 16u)) & 0xffffu;
+}
+
+// The four columns of a word in the four rows that two words name.
+fn symbols_of(rows: vec2<u32>, word: u32) -> vec4<u32> {
+    return vec4<u32>(
+        shuffled[(rows.x & 0xffffu) * sizes.row_words + word],
+        shuffled[(rows.x >> 16u) * sizes.row_words + word],
+        shuffled[(rows.y & 0xffffu) * sizes.row_words + word],
+        shuffled[(rows.y >> 16u) * sizes.row_words + word],
+    );
+}
+
+fn rows_at(at: u32) -> vec4<u32> {
+    return vec4<u32>(grouped[at], grouped[at + 1u], grouped[at + 2u], grouped[at + 3u]);
 }
 
 // Adds T over the histogram and empties it.
@@ -50,19 +76,27 @@ fn joint_terms(local_i: u32, word: u32, lane: u32) -> vec4<u32> {
             count_row(shuffled[grouped_row(base, place) * sizes.row_words + word], lane);
             place += 1u;
         }
-        // Four rows a round keep more loads in flight, and the rounds below lavapipe's 65,535.
-        while place + 4u <= end {
-            let rows_a = grouped[base + (place >> 1u)];
-            let rows_b = grouped[base + (place >> 1u) + 1u];
-            let symbols_0 = shuffled[(rows_a & 0xffffu) * sizes.row_words + word];
-            let symbols_1 = shuffled[(rows_a >> 16u) * sizes.row_words + word];
-            let symbols_2 = shuffled[(rows_b & 0xffffu) * sizes.row_words + word];
-            let symbols_3 = shuffled[(rows_b >> 16u) * sizes.row_words + word];
-            count_row(symbols_0, lane);
-            count_row(symbols_1, lane);
-            count_row(symbols_2, lane);
-            count_row(symbols_3, lane);
-            place += 4u;
+        // Eight rows a round: while they are counted the symbols of the next eight are on their way, and the numbers of the
+        // eight after those, which may be the next symbol's. (And the rounds stay below lavapipe's 65,535.)
+        if place + 8u <= end {
+            let last_at = base + sizes.order_words - 4u;
+            var rows = rows_at(base + (place >> 1u));
+            var first = symbols_of(rows.xy, word);
+            var second = symbols_of(rows.zw, word);
+            place += 8u;
+            rows = rows_at(min(base + (place >> 1u), last_at));
+            while place + 8u <= end {
+                let next_first = symbols_of(rows.xy, word);
+                let next_second = symbols_of(rows.zw, word);
+                rows = rows_at(min(base + (place >> 1u) + 4u, last_at));
+                count_rows(first, lane);
+                count_rows(second, lane);
+                first = next_first;
+                second = next_second;
+                place += 8u;
+            }
+            count_rows(first, lane);
+            count_rows(second, lane);
         }
         while place < end {
             count_row(shuffled[grouped_row(base, place) * sizes.row_words + word], lane);
