@@ -10,7 +10,7 @@ use tempfile::TempDir;
 use tests::{Farm, Process, Signal, farmctl};
 
 /// What must not depend on the farm, the mode or the split; `run.json` tells of the run and may.
-const RESULTS: [&str; 9] = [
+const RESULTS: [&str; 10] = [
     "mi_bits.npy",
     "null_mean_bits.npy",
     "null_sd_bits.npy",
@@ -18,6 +18,7 @@ const RESULTS: [&str; 9] = [
     "p.npy",
     "mi_bits.png",
     "z.png",
+    "z_histogram.png",
     "pairs.csv",
     "sums.bin",
 ];
@@ -124,6 +125,39 @@ fn an_interrupted_run_leaves_what_can_be_continued() {
     let (status, stderr) = start(&farm, &input, &out, &other).finish();
     assert_eq!(status.code(), Some(1), "{stderr}");
     assert!(stderr.contains("another seed"), "{stderr}");
+}
+
+#[test]
+fn filters_leave_out_what_they_say() {
+    let folder = TempDir::new().expect("a temporary folder");
+    // b is short, c is a where both have residues, column 2 holds gaps.
+    let text = b">a\nA-CG\n>b\n---G\n>c\nAACG\n>d\nT-GC\n>e\nT-CC\n".to_vec();
+    let path = folder.path().join("alignment.fasta").display().to_string();
+    fs::write(&path, text).expect("the folder is writable");
+    let out = folder.path().join("out");
+    let shown = out.display().to_string();
+    let run = |more: &[&str]| {
+        let fixed =
+            ["mi", &path, "-o", &shown, "--iterations", "20", "--device", "cpu", "--min-coverage", "0.5"];
+        farmctl(fixed.iter().chain(more))
+    };
+    let ended = run(&["--max-gap-share", "0.5", "--max-identity", "0.9"]);
+    let stderr = String::from_utf8_lossy(&ended.stderr);
+    assert!(ended.status.success() && stderr.contains("3 sequences, 3 columns"), "{stderr}");
+    let record = fs::read(out.join("run.json")).expect("the record is there");
+    let record: serde_json::Value = serde_json::from_slice(&record).expect("it is JSON");
+    assert_eq!((&record["sequences_read"], &record["sequences"]), (&5.into(), &3.into()), "{record}");
+    assert_eq!(record["column_numbers"], serde_json::json!([1, 3, 4]), "{record}");
+    assert_eq!(record["filters"]["max_gap_share"], 0.5, "{record}");
+    let pairs = fs::read_to_string(out.join("pairs.csv")).expect("the pairs are there");
+    assert!(pairs.lines().any(|line| line.starts_with("1,A,4,G,3,")), "{pairs}");
+
+    let ended = run(&["--extend", "--max-identity", "0.1"]);
+    let stderr = String::from_utf8_lossy(&ended.stderr);
+    assert_eq!(ended.status.code(), Some(1), "{stderr}");
+    assert!(stderr.contains("leave 2 of 5 sequences") || stderr.contains("alignment"), "{stderr}");
+    let ended = run(&["--max-identity", "2"]);
+    assert_eq!(ended.status.code(), Some(2), "{}", String::from_utf8_lossy(&ended.stderr));
 }
 
 #[test]

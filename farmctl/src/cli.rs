@@ -132,6 +132,15 @@ pub(crate) struct MiArgs {
     /// Go on from the sums in the folder, up to ITERATIONS in all: the same bytes as in one run.
     #[arg(long)]
     pub extend: bool,
+    /// Leaves out sequences with residues in less than this share of the columns, 0 to 1.
+    #[arg(long, value_name = "SHARE", value_parser = share)]
+    pub min_coverage: Option<f64>,
+    /// Leaves out sequences that share more than this part of their residues with an earlier one, 0 to 1.
+    #[arg(long, value_name = "SHARE", value_parser = share)]
+    pub max_identity: Option<f64>,
+    /// Leaves out columns with gaps in more than this share of the sequences that are left, 0 to 1.
+    #[arg(long, value_name = "SHARE", value_parser = share)]
+    pub max_gap_share: Option<f64>,
     /// What the farm sends back.
     #[arg(long, value_enum, default_value_t = MiMode::Reduce)]
     pub mode: MiMode,
@@ -340,6 +349,12 @@ fn duration(text: &str) -> Result<Duration, String> {
     Duration::try_from_secs_f64(number * seconds).map_err(|error| format!("{text:?}: {error}"))
 }
 
+/// A number from 0 to 1.
+fn share(text: &str) -> Result<f64, String> {
+    let share: f64 = text.parse().map_err(|error| format!("{error}"))?;
+    if (0.0..=1.0).contains(&share) { Ok(share) } else { Err("not from 0 to 1".to_owned()) }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -349,6 +364,14 @@ mod tests {
         assert_eq!("640x360".parse(), Ok(Size { width_px: 640, height_px: 360 }));
         for bad in ["", "640", "0x10", "10x0", "-1x4", "1e3x4", "99999x1"] {
             assert!(bad.parse::<Size>().is_err(), "{bad}");
+        }
+    }
+
+    #[test]
+    fn shares_are_from_0_to_1() {
+        assert_eq!(share("0.25"), Ok(0.25));
+        for bad in ["", "x", "-0.1", "1.5", "nan", "inf"] {
+            assert!(share(bad).is_err(), "{bad}");
         }
     }
 

@@ -155,7 +155,8 @@ pub struct Alignment {
     codes: Vec<u8>,
     /// The symbol of each code, ascending; the gap, where it occurs, is therefore code 0.
     alphabet: Vec<u8>,
-    l: usize,
+    /// The number of each column in the input, from 1.
+    numbers: Vec<usize>,
 }
 
 /// One sequence as a format reader delivers it: upper-case letters and [`GAP`] only.
@@ -213,7 +214,33 @@ impl Alignment {
                 codes[column * n + r] = code_of[usize::from(*symbol)];
             }
         }
-        Ok(Self { names: rows.into_iter().map(|row| row.name).collect(), codes, alphabet, l })
+        let names = rows.into_iter().map(|row| row.name).collect();
+        Ok(Self { names, codes, alphabet, numbers: (1..=l).collect() })
+    }
+
+    /// Some of its sequences and columns, at least one of each, both ascending; the alphabet is what occurs in them.
+    pub(crate) fn select(&self, rows: &[usize], columns: &[usize]) -> Self {
+        let picked = |column: &usize| {
+            let codes = self.column(*column);
+            rows.iter().map(|row| codes[*row])
+        };
+        let mut codes: Vec<u8> = columns.iter().flat_map(picked).collect();
+        let mut occurs = [false; 256];
+        for code in &codes {
+            occurs[usize::from(*code)] = true;
+        }
+        let mut new_code = [0_u8; 256];
+        let mut alphabet = Vec::with_capacity(self.q());
+        for (code, symbol) in (0_u8..).zip(&self.alphabet).filter(|(code, _)| occurs[usize::from(*code)]) {
+            new_code[usize::from(code)] = u8::try_from(alphabet.len()).expect("no more than before");
+            alphabet.push(*symbol);
+        }
+        for code in &mut codes {
+            *code = new_code[usize::from(*code)];
+        }
+        let names = rows.iter().map(|row| self.names[*row].clone()).collect();
+        let numbers = columns.iter().map(|column| self.numbers[*column]).collect();
+        Self { names, codes, alphabet, numbers }
     }
 
     /// Number of sequences, N; at least 2.
@@ -225,7 +252,16 @@ impl Alignment {
     /// Number of columns, L; at least 1.
     #[must_use]
     pub fn l(&self) -> usize {
-        self.l
+        self.numbers.len()
+    }
+
+    /// What a column is called: its number in the input, from 1. Filters leave gaps in these.
+    ///
+    /// # Panics
+    /// `column` is not below L.
+    #[must_use]
+    pub fn number(&self, column: usize) -> usize {
+        self.numbers[column]
     }
 
     /// Number of symbols that occur, q; 1 to 27.
@@ -283,7 +319,7 @@ impl fmt::Display for Alignment {
             f,
             "{} sequences, {} columns, {} symbols ({alphabet}), {:.1} % gaps",
             self.n(),
-            self.l,
+            self.l(),
             self.q(),
             100.0 * self.gap_share()
         )

@@ -1,7 +1,7 @@
 //! Mutual information of sequence alignments with the shuffling null model (thesis 5.5.1; Hamacher 2008, Weil 2009,
 //! Waechter 2012).
 //!
-//! Owns the alignment formats ([`parse`]), the integer definition of mutual information on the host ([`Reference`]) and
+//! Owns the alignment formats ([`parse`]), [`Filters`], the integer definition of mutual information on the host ([`Reference`]) and
 //! the null model with its order-independent sums ([`NullModel`], [`Accumulators`]), and the kernels that compute the same
 //! ([`gpu`]). Everything that a result depends on is an
 //! integer, so the same alignment, seed and iterations give the same bytes on any machine and in any split over jobs. It never
@@ -21,9 +21,11 @@
 //! ```
 
 mod alignment;
+mod filter;
 mod fixed_point;
 mod formats;
 pub mod gpu;
+pub mod histogram;
 #[cfg(feature = "farm")]
 pub mod job;
 mod null_model;
@@ -35,6 +37,7 @@ mod shuffle;
 
 pub use self::{
     alignment::{Alignment, AlignmentError, GAP, MAX_COLUMNS, MAX_ROWS},
+    filter::{FilterError, Filters},
     fixed_point::{FixedPoint, MAX_SCALE_BITS, log2_q57},
     formats::{Format, MAX_LINE_BYTES, Parsed, ParsingNotes, parse, parse_as},
     null_model::{Accumulators, NullModel, NullModelError, PairStatistics},

@@ -58,8 +58,8 @@ pub fn write_npy(out: &mut impl Write, l: usize, matrix: &[f64]) -> io::Result<(
     Ok(())
 }
 
-/// The `top` pairs with the highest z as CSV, ties by mutual information and place. Columns count from 1; residues are
-/// the first sequence's. `mi_apc_bits` is corrected by the average product (Dunn, Wahl and Gloor 2008).
+/// The `top` pairs with the highest z as CSV, ties by mutual information and place. Columns have their numbers in the input
+/// ([`Alignment::number`]); residues are the first sequence's. `mi_apc_bits` is corrected by the average product (Dunn, Wahl and Gloor 2008).
 ///
 /// # Errors
 /// `out` refuses.
@@ -80,11 +80,11 @@ pub fn write_top_pairs(
         writeln!(
             out,
             "{},{},{},{},{},{},{},{},{},{},{},{}",
-            pair.i + 1,
+            alignment.number(pair.i),
             residue(pair.i),
-            pair.j + 1,
+            alignment.number(pair.j),
             residue(pair.j),
-            pair.j - pair.i,
+            alignment.number(pair.j) - alignment.number(pair.i),
             pair.mi_bits,
             pair.null_mean_bits,
             pair.null_sd_bits,

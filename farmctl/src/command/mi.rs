@@ -11,7 +11,7 @@ use std::{
 use anyhow::{Context as _, anyhow};
 use client_sdk::{FarmError, FarmOptions, RunSummary};
 use mi_kernel::{
-    Accumulators, Alignment, NullModel, Reference, Seed, ShuffleKind,
+    Accumulators, Alignment, Filters, NullModel, Reference, Seed, ShuffleKind, histogram,
     job::{MiHandle, MiOptions, Mode, mi_graph},
     output, parse, saved,
 };
@@ -36,7 +36,10 @@ const MAX_INPUT_BYTES: u64 = 4 << 30;
 /// The alignment as read, and what is known of its file.
 #[derive(Debug)]
 struct Input {
+    /// After the filters.
     alignment: Arc<Alignment>,
+    /// Sequences and columns before them.
+    read: [usize; 2],
     format: String,
     blake3: String,
     earlier: Option<Accumulators>,
@@ -102,6 +105,19 @@ fn read(arguments: &MiArgs) -> Result<Input, Failure> {
     if parsed.notes.duplicate_names > 0 {
         eprintln!("farmctl: warning: {} names occur more than once", parsed.notes.duplicate_names);
     }
+    let filters = Filters {
+        min_coverage: arguments.min_coverage,
+        max_identity: arguments.max_identity,
+        max_gap_share: arguments.max_gap_share,
+    };
+    let read = [parsed.alignment.n(), parsed.alignment.l()];
+    let alignment = match filters == Filters::default() {
+        true => parsed.alignment,
+        false => filters.apply(&parsed.alignment).with_context(|| shown(&arguments.alignment))?,
+    };
+    if [alignment.n(), alignment.l()] != read {
+        eprintln!("farmctl: the filters leave {alignment}");
+    }
     fs::create_dir_all(&arguments.folder).with_context(|| shown(&arguments.folder))?;
     let path = arguments.folder.join(SUMS);
     let earlier = match (fs::read(&path), arguments.extend) {
@@ -113,13 +129,14 @@ fn read(arguments: &MiArgs) -> Result<Input, Failure> {
             return Err(Failure::Usage(reason));
         }
         (Ok(sums), true) => {
-            Some(saved::load(&parsed.alignment, Seed(arguments.seed), &sums).with_context(|| shown(&path))?)
+            Some(saved::load(&alignment, Seed(arguments.seed), &sums).with_context(|| shown(&path))?)
         }
         (Err(error), false) if error.kind() == io::ErrorKind::NotFound => None,
         (Err(error), _) => return Err(anyhow::Error::new(error).context(shown(&path)).into()),
     };
     Ok(Input {
-        alignment: Arc::new(parsed.alignment),
+        alignment: Arc::new(alignment),
+        read,
         format: parsed.notes.format.to_string(),
         blake3: blake3::hash(&bytes).to_hex().to_string(),
         earlier,
@@ -172,8 +189,16 @@ async fn finish(
         "input": shown(&arguments.alignment),
         "input_blake3": input.blake3,
         "format": input.format,
+        "sequences_read": input.read[0],
+        "columns_read": input.read[1],
+        "filters": {
+            "min_coverage": arguments.min_coverage,
+            "max_identity": arguments.max_identity,
+            "max_gap_share": arguments.max_gap_share,
+        },
         "sequences": input.alignment.n(),
         "columns": input.alignment.l(),
+        "column_numbers": column_numbers(input),
         "alphabet": String::from_utf8_lossy(input.alignment.alphabet()),
         "gap_share": input.alignment.gap_share(),
         "gaps": "an ordinary symbol (ORMI)",
@@ -202,6 +227,12 @@ async fn finish(
         return Err(failure);
     }
     tell(&summary, arguments, done - before, &best)
+}
+
+/// Which columns of the input the matrices are of, from 1; nothing where it is all of them.
+fn column_numbers(input: &Input) -> Option<Vec<usize>> {
+    let l = input.alignment.l();
+    (l != input.read[1]).then(|| (0..l).map(|column| input.alignment.number(column)).collect())
 }
 
 fn tell(summary: &RunSummary, arguments: &MiArgs, added: usize, best: &str) -> Result<(), Failure> {
@@ -252,6 +283,9 @@ impl Results {
                 place(&self.folder, &format!("{name}.png"), |out| out.write_all(&picture))?;
             }
         }
+        let z: Vec<f64> = pairs.iter().map(|pair| pair.z).collect();
+        let picture = histogram::z_histogram(&z)?;
+        place(&self.folder, "z_histogram.png", |out| out.write_all(&picture))?;
         place(&self.folder, "pairs.csv", |out| {
             output::write_top_pairs(out, &self.alignment, &pairs, self.top)
         })?;
@@ -261,7 +295,8 @@ impl Results {
         place(&self.folder, SUMS, |out| out.write_all(&sums))?;
         let best = pairs.iter().max_by(|a, b| a.z.total_cmp(&b.z).then(a.mi_bits.total_cmp(&b.mi_bits)));
         Ok(best.map_or_else(String::new, |best| {
-            format!("highest Z {:.1}: columns {} and {}", best.z, best.i + 1, best.j + 1)
+            let number = |column| self.alignment.number(column);
+            format!("highest Z {:.1}: columns {} and {}", best.z, number(best.i), number(best.j))
         }))
     }
 }
