@@ -60,6 +60,8 @@ pub(crate) enum Verb {
     Mi(MiArgs),
     /// Write one of the shipped scenes into a folder.
     Scene(SceneArgs),
+    /// Write a random alignment, of the sizes of the thesis' sets or of any other.
+    Alignment(AlignmentArgs),
     /// Show the farm: nodes, devices, queues, applications.
     Status(StatusArgs),
     /// Show what ran when and where: a table, a picture, or a trace for ui.perfetto.dev.
@@ -187,6 +189,29 @@ pub(crate) struct SceneArgs {
     /// Size of the generated geometry, where the scene has one (triangles, roughly).
     #[arg(long)]
     pub triangles: Option<u32>,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct AlignmentArgs {
+    /// Which sizes; `farmctl alignment list` names them.
+    pub name: String,
+    /// The FASTA file to write.
+    pub file: Option<PathBuf>,
+    /// Sequences, instead of the set's.
+    #[arg(long)]
+    pub sequences: Option<usize>,
+    /// Columns, instead of the set's.
+    #[arg(long)]
+    pub columns: Option<usize>,
+    /// Symbols, the gap among them; 21 without it.
+    #[arg(long)]
+    pub symbols: Option<usize>,
+    /// Columns that hold one symbol in nine of ten places.
+    #[arg(long)]
+    pub conserved: bool,
+    /// Same seed, same bytes.
+    #[arg(long, default_value_t = 1)]
+    pub seed: u64,
 }
 
 #[derive(Debug, Args)]

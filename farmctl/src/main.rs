@@ -48,6 +48,7 @@ fn run(cli: &Cli) -> Result<(), Failure> {
             Verb::Render(arguments) => Box::pin(command::render::run(arguments, coordinator)).await,
             Verb::Mi(arguments) => Box::pin(command::mi::run(arguments, coordinator)).await,
             Verb::Scene(arguments) => command::scene::run(arguments),
+            Verb::Alignment(arguments) => command::alignment::run(arguments),
             Verb::Status(arguments) => command::status::run(arguments, coordinator, cli.output).await,
             Verb::Timeline(arguments) => command::timeline::run(arguments, coordinator, cli.output).await,
             Verb::Node(verb) => command::node::run(verb, coordinator).await,

@@ -21,19 +21,16 @@ use farm_core::{
 use gpu_exec::{DeviceSpec, Executor, ExecutorConfig, ExecutorEvent, Order, expand};
 use mi_kernel::{
     Alignment, Reference, Seed,
+    generate::RandomAlignment,
     gpu::{AlignmentContents, MiJob, PackedAlignment, Pass, Shape, module_source},
     parse,
 };
 
-/// N, L and q of the thesis' sets (5.5.1).
-const THESIS: [[usize; 3]; 3] = [[45_000, 1_400, 21], [4_176, 5_025, 21], [20_000, 2_189, 21]];
-const SYMBOLS: &[u8] = b"-ACDEFGHIKLMNPQRSTVWYBZXUOJ";
 const LIMIT: Duration = Duration::from_secs(600);
 
 struct Arguments {
-    sets: Vec<[usize; 3]>,
+    sets: Vec<RandomAlignment>,
     iterations: u64,
-    conserved: bool,
     unchecked: bool,
 }
 
@@ -47,33 +44,23 @@ fn arguments() -> Result<Arguments, Box<dyn Error>> {
         }
     }
     let (sets, iterations) = match numbers[..] {
-        [] => (THESIS.to_vec(), 10),
-        [n, l, q] => (vec![[n, l, q]], 10),
-        [n, l, q, iterations] => (vec![[n, l, q]], iterations as u64),
+        [] => (RandomAlignment::THESIS.to_vec(), 10),
+        [n, l, q] => (vec![sizes(n, l, q)], 10),
+        [n, l, q, iterations] => (vec![sizes(n, l, q)], iterations as u64),
         _ => return Err("expected N L Q [ITERATIONS]".into()),
     };
-    if sets.iter().any(|[_, _, q]| !(1..=SYMBOLS.len()).contains(q)) {
-        return Err(format!("Q must be 1 to {}", SYMBOLS.len()).into());
-    }
-    Ok(Arguments { sets, iterations, conserved, unchecked })
+    let sets = sets.into_iter().map(|sizes| RandomAlignment { conserved, ..sizes }).collect();
+    Ok(Arguments { sets, iterations, unchecked })
+}
+
+const fn sizes(n: usize, l: usize, q: usize) -> RandomAlignment {
+    RandomAlignment { symbols: q, ..RandomAlignment::proteins(n, l) }
 }
 
 /// Random residues; the same sizes always give the same.
-fn generate([n, l, q]: [usize; 3], conserved: bool) -> Result<Alignment, Box<dyn Error>> {
-    let mut state = 1_u64;
-    let mut draw = || {
-        state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
-        usize::try_from(state >> 33)
-    };
-    let mut text = Vec::with_capacity(n * (l + 1));
-    for _ in 0..n {
-        for column in 0..l {
-            let value = draw()?;
-            let code = if conserved && value % 10 != 0 { column } else { value / 10 };
-            text.push(SYMBOLS[code % q]);
-        }
-        text.push(b'\n');
-    }
+fn generate(sizes: &RandomAlignment) -> Result<Alignment, Box<dyn Error>> {
+    let mut text = Vec::with_capacity(sizes.sequences * (sizes.columns + 10));
+    sizes.write_fasta(&mut text)?;
     Ok(parse(&text)?.alignment)
 }
 
@@ -118,8 +105,8 @@ impl Bench {
     }
 }
 
-fn measure(bench: &mut Bench, arguments: &Arguments, set: [usize; 3]) -> Result<(), Box<dyn Error>> {
-    let alignment = generate(set, arguments.conserved)?;
+fn measure(bench: &mut Bench, arguments: &Arguments, set: &RandomAlignment) -> Result<(), Box<dyn Error>> {
+    let alignment = generate(set)?;
     let shape = Shape::new(&alignment)?;
     let reference = Reference::unscored(&alignment)?;
     let packed = PackedAlignment::new(&reference, &shape);
@@ -183,7 +170,7 @@ fn measure(bench: &mut Bench, arguments: &Arguments, set: [usize; 3]) -> Result<
         alignment.n(),
         alignment.l(),
         alignment.q(),
-        arguments.conserved,
+        set.conserved,
         arguments.iterations,
         per_iteration_ms,
         wall.as_secs_f64() * 1e3 / arguments.iterations as f64,
@@ -202,5 +189,5 @@ fn main() -> Result<(), Box<dyn Error>> {
     let device = expand(&[DeviceSpec::All])?;
     let executor = Executor::start(&device[0], config, move |event| drop(events.send(event)))?;
     let mut bench = Bench { executor, inbox, sequence: 0 };
-    arguments.sets.iter().try_for_each(|set| measure(&mut bench, &arguments, *set))
+    arguments.sets.iter().try_for_each(|set| measure(&mut bench, &arguments, set))
 }

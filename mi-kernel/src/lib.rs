@@ -24,6 +24,7 @@ mod alignment;
 mod filter;
 mod fixed_point;
 mod formats;
+pub mod generate;
 pub mod gpu;
 pub mod histogram;
 #[cfg(feature = "farm")]

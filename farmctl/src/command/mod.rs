@@ -1,5 +1,6 @@
 //! One file per verb: checked arguments in, work done through the libraries, a `Failure` or nothing out.
 
+pub(crate) mod alignment;
 pub(crate) mod mi;
 pub(crate) mod node;
 pub(crate) mod render;
