@@ -98,7 +98,7 @@ fn the_farm_does_not_show_in_the_bytes() {
     assert_same(&out("quiet"), &out("extended"), "extended");
     assert_same(&out("quiet"), &out("matrix"), "matrix mode");
     let differs = files(&out("quiet")).into_iter().zip(files(&out("seed"))).filter(|(a, b)| a != b).count();
-    assert_eq!(differs, 7, "another seed changes all but the observed matrix and its picture");
+    assert_eq!(differs, 8, "another seed changes all but the observed matrix and its picture");
     let pairs = fs::read_to_string(out("quiet").join("pairs.csv")).expect("the table is there");
     let top = pairs.lines().nth(1).unwrap_or_default();
     assert!(top.starts_with("4,") && top.contains(",12,"), "the planted pair is not on top: {top}");
