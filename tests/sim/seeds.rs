@@ -69,3 +69,15 @@ fn fair_shares() {
     let checks = sweep("fair", 0..8);
     assert!(checks.lags > 1_000, "lags were looked at");
 }
+
+#[test]
+fn plugins() {
+    let Checks { plugin_answers, executions, .. } = sweep("plugins", 0..250);
+    assert!(plugin_answers > 0 && executions > 0, "no plug-in was asked");
+}
+
+#[test]
+fn classes() {
+    let Checks { yields, executions, .. } = sweep("classes", 0..250);
+    assert!(yields > 0 && executions > 0, "no job made way");
+}

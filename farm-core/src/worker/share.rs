@@ -178,9 +178,9 @@ impl Lags {
         self.mean_charge.unwrap_or(UNKNOWN_CHARGE)
     }
 
-    /// It had its share, and a largest job more.
+    /// It had its share, and half a largest job more: several interactive applications may each be ahead by that.
     pub(super) fn had_too_much(&self, app: AppId) -> bool {
-        self.due(app) < -self.largest_charge
+        self.due(app) < -self.largest_charge / 2.0
     }
 
     /// What it is owed (if positive), in largest charges. Zero if it is not here.

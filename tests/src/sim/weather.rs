@@ -69,6 +69,10 @@ pub(super) enum Kind {
     Scores,
     /// Applications allow stealing between nodes.
     Stealing,
+    /// Every other application is interactive. As `Plugins`.
+    Classes,
+    /// Applications choose a plug-in. Not in [`Self::ALL`]: it has a scenario of its own, in every seed.
+    Plugins,
 }
 
 impl Kind {
@@ -117,6 +121,7 @@ impl Weather {
         // Another generator than the world's: what happens in it does not depend on how it was drawn.
         let mut rng = SmallRng::seed_from_u64(!seed);
         let density = [0.1, 0.3, 0.6][rng.random_range(0..3)];
+        let (plugin, interactive) = (kinds.contains(&Kind::Plugins), kinds.contains(&Kind::Classes));
         let kinds: BTreeSet<Kind> = kinds.iter().copied().filter(|_| rng.random_bool(density)).collect();
         let has = |kind| kinds.contains(&kind);
         let workers = rng.random_range(2..=5);
@@ -131,6 +136,8 @@ impl Weather {
             max_crashes: if has(Kind::Crashes) || has(Kind::Fetches) { 1_000 } else { 3 },
             max_jobs: if rng.random_bool(0.3) { 40 } else { 10_000 },
             global_stealing: has(Kind::Stealing),
+            interactive,
+            plugin,
             score_error: if has(Kind::Scores) { 3.0 } else { 1.0 },
             skewed_clocks: has(Kind::Skew),
             distances: if has(Kind::Distance) { Distances::Mixed } else { Distances::Lan },
@@ -231,7 +238,9 @@ impl Weather {
             | Kind::Fetches
             | Kind::Skew
             | Kind::Scores
-            | Kind::Stealing => return None,
+            | Kind::Stealing
+            | Kind::Classes
+            | Kind::Plugins => return None,
         };
         Some(Happening::Fault(fault))
     }

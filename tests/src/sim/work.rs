@@ -48,19 +48,21 @@ impl World {
     /// Has an application submit a task of `count` jobs at a time. Every other task's costs are known.
     pub fn submit(&mut self, at_ms: u64, app: usize, task: u32, count: u32) {
         self.apps[app].expected += usize::try_from(count).expect("small");
-        let jobs = jobs(count, task.is_multiple_of(2));
+        let interactive = self.setup.interactive && app.is_multiple_of(2);
+        let class = if interactive { LatencyClass::Interactive } else { LatencyClass::Batch };
+        let jobs = jobs(count, class, task.is_multiple_of(2));
         let event = Event::Submitted { task: TaskId(task), jobs, needs: Requirements::ANY };
         self.at(Instant(at_ms * MILLISECOND), Happening::App { app, event });
     }
 }
 
-fn jobs(count: u32, known_cost: bool) -> Vec<SubmittedJob> {
+fn jobs(count: u32, class: LatencyClass, known_cost: bool) -> Vec<SubmittedJob> {
     let content = |tag| Content { hash: ContentHash([tag; 32]), size_bytes: 1_024 };
     (0..count)
         .map(|index| SubmittedJob {
             index: JobIndex(index),
             cost: CostNs(if known_cost { cost_ns(JobIndex(index)) } else { 0 }),
-            class: LatencyClass::Batch,
+            class,
             priority: Priority(i32::from(index % 7 == 0)),
             module: Some(ContentHash([1; 32])),
             contents: vec![content(1), content(u8::try_from(2 + index % 3).expect("small"))],

@@ -6,7 +6,10 @@ use std::{
 };
 
 use farm_core::{
-    coordinator::CoordinatorMachine,
+    coordinator::{
+        self, CoordinatorMachine,
+        policy::{Choice, QuestionId},
+    },
     id::{DeviceIndex, LinkId, NodeId, NodeSession},
     ledger, message,
     time::Instant,
@@ -119,6 +122,15 @@ pub enum Happening {
         /// What.
         event: ledger::Event,
     },
+    /// A plug-in answers the coordinator.
+    PluginAnswers {
+        /// Epoch of the coordinator that asked.
+        epoch: u32,
+        /// What it asked.
+        question: QuestionId,
+        /// The choices, or why there are none.
+        answer: Result<Vec<Choice>, String>,
+    },
     /// Something goes wrong.
     Fault(Fault),
 }
@@ -133,7 +145,11 @@ impl Happening {
             | Self::Closed { .. }
             | Self::NotOpened { .. }
             | Self::Dial { .. } => true,
-            Self::Worker { .. } | Self::JobDone { .. } | Self::App { .. } | Self::Fault(_) => false,
+            Self::Worker { .. }
+            | Self::JobDone { .. }
+            | Self::App { .. }
+            | Self::PluginAnswers { .. }
+            | Self::Fault(_) => false,
         }
     }
 }
@@ -153,6 +169,10 @@ pub struct Setup {
     pub max_jobs: usize,
     /// The applications allow it.
     pub global_stealing: bool,
+    /// Every other application's jobs are interactive.
+    pub interactive: bool,
+    /// The applications choose a plug-in, which answers well, wrongly, late or never.
+    pub plugin: bool,
     /// Announced scores are wrong by up to this factor, either way.
     pub score_error: f64,
     /// Each process has a clock of its own.
@@ -172,6 +192,8 @@ impl Setup {
             max_crashes: 3,
             max_jobs: 10_000,
             global_stealing: false,
+            interactive: false,
+            plugin: false,
             score_error: 1.0,
             skewed_clocks: false,
             distances: Distances::Lan,
@@ -265,7 +287,7 @@ impl World {
         }
         for app in 0..world.setup.apps {
             let clock = world.new_clock();
-            world.apps.push(AppHost::new(app, world.setup.global_stealing, clock));
+            world.apps.push(AppHost::new(app, &world.setup, clock));
             world.after(Duration::ZERO, Happening::Dial { proc: Proc::App(app), life: 0 });
         }
         world
@@ -461,6 +483,12 @@ impl World {
                 }
             }
             Happening::App { app, event } => self.app_event(app, event),
+            Happening::PluginAnswers { epoch, question, answer } => {
+                if self.store.epoch == epoch {
+                    self.audit.checks.plugin_answers += u64::from(answer.is_ok());
+                    self.coordinator_event(coordinator::Event::PolicyAnswered { question, answer });
+                }
+            }
             Happening::Fault(fault) => self.fault(fault),
         }
     }

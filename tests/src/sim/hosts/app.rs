@@ -15,12 +15,13 @@ use farm_core::{
     time::Instant,
 };
 
+use super::coordinator::PLUGIN;
 use crate::sim::{
     clock::Clock,
     faults::Fault,
     network::{Message, Proc},
     work::digest,
-    world::{Happening, World},
+    world::{Happening, Setup, World},
 };
 
 /// How a job ended, as its application saw it.
@@ -62,6 +63,7 @@ pub struct AppHost {
     clock: Clock,
     state: State,
     global_stealing: bool,
+    policy: &'static str,
     pub(in crate::sim) control: Option<LinkId>,
     pub(in crate::sim) nodes: BTreeMap<(NodeId, NodeSession), LinkId>,
     programs: BTreeSet<(TaskId, JobIndex)>,
@@ -80,10 +82,11 @@ struct Submission {
 }
 
 impl AppHost {
-    pub(in crate::sim) fn new(index: usize, global_stealing: bool, clock: Clock) -> Self {
+    pub(in crate::sim) fn new(index: usize, setup: &Setup, clock: Clock) -> Self {
+        let (global_stealing, policy) = (setup.global_stealing, if setup.plugin { PLUGIN } else { "" });
         Self {
             index,
-            ledger: Ledger::new(hello(index, global_stealing, None)),
+            ledger: Ledger::new(hello(index, global_stealing, policy, None)),
             endings: BTreeMap::new(),
             expected: 0,
             waits: 0,
@@ -92,6 +95,7 @@ impl AppHost {
             clock,
             state: State::Up,
             global_stealing,
+            policy,
             control: None,
             nodes: BTreeMap::new(),
             programs: BTreeSet::new(),
@@ -144,13 +148,18 @@ impl AppHost {
     }
 }
 
-fn hello(index: usize, global_stealing: bool, resume: Option<(AppId, AppIncarnation)>) -> AppHello {
+fn hello(
+    index: usize,
+    global_stealing: bool,
+    policy: &str,
+    resume: Option<(AppId, AppIncarnation)>,
+) -> AppHello {
     AppHello {
         protocol: PROTOCOL_VERSION,
         name: format!("app-{index}"),
         weight: 1.0 + f64::from(u32::try_from(index).expect("few applications")),
         global_stealing,
-        policy: String::new(),
+        policy: policy.to_owned(),
         resume,
     }
 }
@@ -259,7 +268,7 @@ impl World {
         let host = &mut self.apps[index];
         host.state = State::Up;
         host.clock = clock;
-        let hello = hello(host.index, host.global_stealing, host.identity);
+        let hello = hello(host.index, host.global_stealing, host.policy, host.identity);
         host.ledger = Ledger::resumed(hello, host.ledger.next_batch());
         for Submission { task, mut jobs, needs } in std::mem::take(&mut host.submitted) {
             jobs.retain(|job| !self.apps[index].endings.contains_key(&(task, job.index)));

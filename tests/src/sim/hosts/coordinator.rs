@@ -1,19 +1,28 @@
 //! The coordinator's process, and what it finds on its disk when it starts.
 
+use std::time::Duration;
+
 use farm_core::{
-    coordinator::{CoordinatorConfig, CoordinatorMachine, Effect, Event},
+    coordinator::{
+        CoordinatorConfig, CoordinatorMachine, Effect, Event,
+        policy::{Choice, Question, QuestionId},
+    },
     id::Epoch,
 };
+use rand::{Rng as _, SeedableRng as _, rngs::SmallRng};
 
 use crate::sim::{
     auditor::Auditor,
     network::{Message, Proc},
-    world::{World, liveness},
+    world::{Happening, World, liveness},
 };
 
 /// How long a vanished application keeps its jobs, in milliseconds: three times what a silent node gets, as in the
 /// design.
 const APP_LEASE_MS: u64 = 3_000;
+
+/// The plug-in that the coordinator knows.
+pub(in crate::sim) const PLUGIN: &str = "plugin";
 
 /// What survives the coordinator's process: what it committed.
 #[derive(Clone, Copy, Debug)]
@@ -29,6 +38,7 @@ impl Store {
             liveness: liveness(),
             app_lease_ms: APP_LEASE_MS,
             max_crashes,
+            plugins: [PLUGIN.to_owned()].into(),
             ..config
         })
     }
@@ -86,9 +96,32 @@ impl World {
                     self.send(Proc::Coordinator, link, Message::CoordinatorToNode(message));
                 }
                 Effect::Close { link } => self.hang_up(Proc::Coordinator, link),
-                Effect::AskPolicy { plugin, .. } => panic!("nobody chose {plugin}"),
+                Effect::AskPolicy { id, question, .. } => self.plugin_thinks(id, &question),
             }
         }
         self.rearm(Proc::Coordinator);
+    }
+
+    /// Half of the answers are good ones; the others come too late or never, are none, or leave a job out.
+    fn plugin_thinks(&mut self, question: QuestionId, asked: &Question) {
+        // A generator of its own: without plug-ins the world draws as it always did.
+        let seed = self.setup.seed ^ (u64::from(self.store.epoch) << 32) ^ question.0;
+        let mut rng = SmallRng::seed_from_u64(seed);
+        let count = |length: usize| u32::try_from(length).expect("batches and farms are small");
+        let (jobs, devices) = (count(asked.jobs.len()), count(asked.devices.len()));
+        let mut choices: Vec<Choice> =
+            (0..jobs).map(|job| Choice { job, device: rng.random_range(0..devices) }).collect();
+        let (after_ms, answer) = match rng.random_range(0..8) {
+            0..4 => (rng.random_range(1..90), Ok(choices)),
+            4 => (rng.random_range(110..300), Ok(choices)),
+            5 => (rng.random_range(1..90), Err("it crashed".to_owned())),
+            6 => {
+                choices.pop();
+                (rng.random_range(1..90), Ok(choices))
+            }
+            _ => return,
+        };
+        let happening = Happening::PluginAnswers { epoch: self.store.epoch, question, answer };
+        self.after(Duration::from_millis(after_ms), happening);
     }
 }

@@ -8,7 +8,7 @@ use std::{
 use farm_core::{
     device::{DeviceInfo, DeviceKind, Features, Limits},
     id::{Attempt, ContentHash, DeviceIndex, JobAttempt, JobId, LinkId, NodeSession},
-    message::{AppToNode, Contact, CoordinatorToNode, JobFailure, NodeToApp},
+    message::{AppToNode, Contact, CoordinatorToNode, JobFailure, LatencyClass, NodeToApp},
     time::Instant,
     worker::{Effect, Event, Share, WorkerConfig, WorkerMachine},
 };
@@ -46,14 +46,17 @@ pub struct WorkerHost {
     next_run: u64,
 }
 
-/// A device with its running and its staged job.
+/// A device with its running and its staged jobs.
 #[derive(Debug)]
 struct Executor {
     lost: bool,
     /// How many times slower than when it is well.
     slowness: f64,
     running: Option<Run>,
-    staged: VecDeque<JobAttempt>,
+    /// A batch job that made way, with what it has left.
+    interrupted: Option<Run>,
+    /// One of each class at most, interactive ones first.
+    staged: VecDeque<(JobAttempt, LatencyClass)>,
     /// Since when it has nothing.
     idle_since: Option<Instant>,
 }
@@ -62,17 +65,34 @@ struct Executor {
 #[derive(Clone, Copy, Debug)]
 struct Run {
     job: JobAttempt,
+    class: LatencyClass,
     number: u64,
     started_at: Instant,
+    /// What it needs from there.
+    left: Duration,
+    /// What it had before an interruption.
+    ran_before: Duration,
 }
 
 impl Executor {
     const fn new(now: Instant) -> Self {
-        Self { lost: false, slowness: 1.0, running: None, staged: VecDeque::new(), idle_since: Some(now) }
+        Self {
+            lost: false,
+            slowness: 1.0,
+            running: None,
+            interrupted: None,
+            staged: VecDeque::new(),
+            idle_since: Some(now),
+        }
     }
 
     fn holds(&self, job: JobAttempt) -> bool {
-        self.running.is_some_and(|run| run.job == job) || self.staged.contains(&job)
+        self.held().any(|held| held == job)
+    }
+
+    fn held(&self) -> impl Iterator<Item = JobAttempt> {
+        let begun = self.running.iter().chain(&self.interrupted).map(|run| run.job);
+        begun.chain(self.staged.iter().map(|(job, _)| *job))
     }
 }
 
@@ -188,8 +208,8 @@ impl WorkerHost {
     }
 
     pub(in crate::sim) fn kept(&self) -> usize {
-        let on_devices = |device: &Executor| usize::from(device.running.is_some()) + device.staged.len();
-        self.programs.len() + self.payloads.len() + self.devices.iter().map(on_devices).sum::<usize>()
+        let on_devices = self.devices.iter().map(|device| device.held().count()).sum::<usize>();
+        self.programs.len() + self.payloads.len() + on_devices
     }
 
     /// I8: at quiescence nothing is kept.
@@ -236,12 +256,18 @@ impl World {
         let Some(machine) = &mut self.workers[index].machine else { return };
         if due {
             machine.check_invariants();
-            self.audit.shares(index, machine);
+            self.audit.shares(index, machine, self.setup.interactive);
         }
         let effects: Vec<Effect> = std::iter::from_fn(|| machine.poll_effect()).collect();
         for effect in effects {
             self.log.enter(self.now, Proc::Worker(index), &effect);
             self.worker_effect(index, effect);
+        }
+        // Executors take orders in as they come, and begin when there is no further one.
+        for device in 0..self.workers[index].devices.len() {
+            let device = DeviceIndex(u16::try_from(device).expect("few devices"));
+            self.make_way(index, device);
+            self.run_next(index, device);
         }
         self.rearm(Proc::Worker(index));
     }
@@ -266,7 +292,7 @@ impl World {
             }
             Effect::CloseApp { link } => self.hang_up(proc, link),
             Effect::Fetch { content, link } => self.fetch(index, content.hash, link),
-            Effect::Execute { job, device, .. } => self.execute(index, job, device),
+            Effect::Execute { job, device, class } => self.execute(index, job, device, class),
             Effect::Abort { job, device } => self.abort(index, job, device),
             Effect::Discard(job) => {
                 self.workers[index].programs.remove(&job);
@@ -330,7 +356,7 @@ impl World {
         self.after(delay, Happening::Worker { worker: index, life, event });
     }
 
-    fn execute(&mut self, index: usize, job: JobAttempt, device: DeviceIndex) {
+    fn execute(&mut self, index: usize, job: JobAttempt, device: DeviceIndex, class: LatencyClass) {
         let host = &mut self.workers[index];
         assert!(host.programs.contains(&job), "{job} is executed without its program");
         let newest = host.newest.entry(job.job).or_insert(job.attempt);
@@ -338,44 +364,75 @@ impl World {
         *newest = job.attempt;
         let executor = &mut host.devices[usize::from(device.0)];
         assert!(!executor.lost, "{job} is given to a lost device");
-        assert!(executor.staged.is_empty(), "{device} has a staged job already");
-        executor.staged.push_back(job);
-        self.run_next(index, device);
+        let same = executor.staged.iter().filter(|(_, staged)| *staged == class).count();
+        let begins = usize::from(executor.running.is_none());
+        assert!(same <= begins, "{device} has a staged job of this class already");
+        let before = executor.staged.iter().filter(|(_, staged)| *staged >= class).count();
+        executor.staged.insert(before, (job, class));
     }
 
+    /// A running batch job goes off the device, its state kept, where an interactive one is staged.
+    fn make_way(&mut self, index: usize, device: DeviceIndex) {
+        let now = self.now;
+        let host = &mut self.workers[index];
+        let executor = &mut host.devices[usize::from(device.0)];
+        let waits = executor.staged.front().is_some_and(|(_, class)| *class == LatencyClass::Interactive);
+        let is_batch = |run: &mut Run| run.class == LatencyClass::Batch;
+        let Some(run) = executor.running.take_if(|run| waits && is_batch(run)) else { return };
+        let ran = now.since(run.started_at);
+        let (left, ran_before) = (run.left.saturating_sub(ran), run.ran_before + ran);
+        assert!(executor.interrupted.is_none(), "two batch jobs have begun on {device}");
+        executor.interrupted = Some(Run { left, ran_before, ..run });
+        let (life, job) = (host.life, run.job);
+        let event = Event::Yielded { job, device };
+        self.audit.checks.yields += 1;
+        self.after(Duration::ZERO, Happening::Worker { worker: index, life, event });
+    }
+
+    /// An interactive job first, then one that made way, then the next.
     fn run_next(&mut self, index: usize, device: DeviceIndex) {
         let host = &mut self.workers[index];
         let executor = &mut host.devices[usize::from(device.0)];
         if executor.running.is_some() {
             return;
         }
-        let Some(job) = executor.staged.pop_front() else {
-            executor.idle_since = Some(self.now);
+        let waits = executor.staged.front().is_some_and(|(_, class)| *class == LatencyClass::Interactive);
+        let back = if waits { None } else { executor.interrupted.take() };
+        let Some(run) = back.or_else(|| {
+            let (job, class) = executor.staged.pop_front()?;
+            let speed = host.speeds[usize::from(device.0)] / executor.slowness;
+            #[expect(
+                clippy::cast_possible_truncation,
+                clippy::cast_sign_loss,
+                reason = "milliseconds, far from the limits"
+            )]
+            let left = Duration::from_nanos((cost_ns(job.job.index) as f64 / speed) as u64);
+            Some(Run { job, class, number: 0, started_at: self.now, left, ran_before: Duration::ZERO })
+        }) else {
+            executor.idle_since.get_or_insert(self.now);
             return;
         };
         host.next_run += 1;
         let number = host.next_run;
-        executor.running = Some(Run { job, number, started_at: self.now });
+        executor.running = Some(Run { number, started_at: self.now, ..run });
         executor.idle_since = None;
-        let speed = host.speeds[usize::from(device.0)] / executor.slowness;
-        #[expect(
-            clippy::cast_possible_truncation,
-            clippy::cast_sign_loss,
-            reason = "milliseconds, far from the limits"
-        )]
-        let duration = Duration::from_nanos((cost_ns(job.job.index) as f64 / speed) as u64);
-        let life = host.life;
-        self.audit.begins(index, job.job);
-        let started = Event::Started { job, device };
-        self.after(Duration::ZERO, Happening::Worker { worker: index, life, event: started });
-        self.after(duration, Happening::JobDone { worker: index, life, device, run: number });
+        let (life, job) = (host.life, run.job);
+        let event = match back {
+            Some(_) => Event::Resumed { job, device },
+            None => {
+                self.audit.begins(index, job.job);
+                Event::Started { job, device }
+            }
+        };
+        self.after(Duration::ZERO, Happening::Worker { worker: index, life, event });
+        self.after(run.left, Happening::JobDone { worker: index, life, device, run: number });
     }
 
     pub(in crate::sim) fn job_done(&mut self, index: usize, device: DeviceIndex, number: u64) {
         let host = &mut self.workers[index];
         let running = &mut host.devices[usize::from(device.0)].running;
         let Some(run) = running.take_if(|run| run.number == number) else { return };
-        let took = host.clock.shows(self.now).since(host.clock.shows(run.started_at));
+        let took = run.ran_before + host.clock.shows(self.now).since(host.clock.shows(run.started_at));
         let job = run.job;
         let crashes = self.work.crash_one_in > 0 && self.rng.random_ratio(1, self.work.crash_one_in);
         let outcome = if self.work.poison.contains(&job.job.task) || crashes {
@@ -395,9 +452,12 @@ impl World {
     fn abort(&mut self, index: usize, job: JobAttempt, device: DeviceIndex) {
         let host = &mut self.workers[index];
         let executor = &mut host.devices[usize::from(device.0)];
-        executor.staged.retain(|staged| *staged != job);
-        if executor.running.take_if(|run| run.job == job).is_none() {
-            return;
+        executor.staged.retain(|(staged, _)| *staged != job);
+        let is_it = |run: &mut Run| run.job == job;
+        let begun = executor.running.take_if(is_it).or_else(|| executor.interrupted.take_if(is_it));
+        let Some(run) = begun else { return };
+        if run.started_at == self.now && run.ran_before.is_zero() {
+            self.audit.did_not_begin(job.job);
         }
         let life = host.life;
         let event = Event::Executed { job, device, device_time_ns: 0, outcome: Err(JobFailure::Cancelled) };
