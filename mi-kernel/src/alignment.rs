@@ -199,21 +199,13 @@ impl Alignment {
             let (line, name) = (first.line, first.name.clone());
             return Err(AlignmentError::TooManyColumns { line, name, length: l, limit: MAX_COLUMNS });
         }
-        let mut occurs = [false; 256];
-        for symbol in rows.iter().flat_map(|row| &row.symbols) {
-            occurs[usize::from(*symbol)] = true;
-        }
-        let alphabet: Vec<u8> = (0..=u8::MAX).filter(|symbol| occurs[usize::from(*symbol)]).collect();
-        let mut code_of = [0u8; 256];
-        for (code, symbol) in (0u8..).zip(&alphabet) {
-            code_of[usize::from(*symbol)] = code;
-        }
-        let mut codes = vec![0u8; n * l];
+        let mut symbols = vec![0_u8; n * l];
         for (r, row) in rows.iter().enumerate() {
             for (column, symbol) in row.symbols.iter().enumerate() {
-                codes[column * n + r] = code_of[usize::from(*symbol)];
+                symbols[column * n + r] = *symbol;
             }
         }
+        let (codes, alphabet) = coded(symbols);
         let names = rows.into_iter().map(|row| row.name).collect();
         Ok(Self { names, codes, alphabet, numbers: (1..=l).collect() })
     }
@@ -222,22 +214,9 @@ impl Alignment {
     pub(crate) fn select(&self, rows: &[usize], columns: &[usize]) -> Self {
         let picked = |column: &usize| {
             let codes = self.column(*column);
-            rows.iter().map(|row| codes[*row])
+            rows.iter().map(|row| self.alphabet[usize::from(codes[*row])])
         };
-        let mut codes: Vec<u8> = columns.iter().flat_map(picked).collect();
-        let mut occurs = [false; 256];
-        for code in &codes {
-            occurs[usize::from(*code)] = true;
-        }
-        let mut new_code = [0_u8; 256];
-        let mut alphabet = Vec::with_capacity(self.q());
-        for (code, symbol) in (0_u8..).zip(&self.alphabet).filter(|(code, _)| occurs[usize::from(*code)]) {
-            new_code[usize::from(code)] = u8::try_from(alphabet.len()).expect("no more than before");
-            alphabet.push(*symbol);
-        }
-        for code in &mut codes {
-            *code = new_code[usize::from(*code)];
-        }
+        let (codes, alphabet) = coded(columns.iter().flat_map(picked).collect());
         let names = rows.iter().map(|row| self.names[*row].clone()).collect();
         let numbers = columns.iter().map(|column| self.numbers[*column]).collect();
         Self { names, codes, alphabet, numbers }
@@ -310,6 +289,23 @@ impl Alignment {
         let gaps = self.codes.iter().filter(|code| **code == 0).count();
         gaps as f64 / self.codes.len() as f64
     }
+}
+
+/// Dense codes in the place of symbols, and the symbol of each code, ascending.
+fn coded(mut symbols: Vec<u8>) -> (Vec<u8>, Vec<u8>) {
+    let mut occurs = [false; 256];
+    for symbol in &symbols {
+        occurs[usize::from(*symbol)] = true;
+    }
+    let alphabet: Vec<u8> = (0..=u8::MAX).filter(|symbol| occurs[usize::from(*symbol)]).collect();
+    let mut code_of = [0_u8; 256];
+    for (code, symbol) in (0_u8..).zip(&alphabet) {
+        code_of[usize::from(*symbol)] = code;
+    }
+    for symbol in &mut symbols {
+        *symbol = code_of[usize::from(*symbol)];
+    }
+    (symbols, alphabet)
 }
 
 impl fmt::Display for Alignment {

@@ -137,12 +137,13 @@ impl CoordinatorMachine {
     fn place_batch(&mut self, now: Instant, pending: Pending) {
         let Some((pending, mut question)) = self.question(now, pending) else { return };
         let Some(app) = self.apps.get(&pending.app) else { return };
-        let Some(module) = app.batches.get(&pending.batch).map(|batch| batch.module) else { return };
         let choices = match &app.policy {
             Policy::Fcfs => Fcfs.place(&question),
             Policy::History => {
-                let load = |point_ns| self.modules.load(module, point_ns);
-                self.history.recall(&app.name, load, &mut question.jobs);
+                if let Some(batch) = app.batches.get(&pending.batch) {
+                    let load = |point_ns| self.modules.load(batch.module, point_ns);
+                    self.history.recall(&app.name, load, &mut question.jobs);
+                }
                 LongestFirst.place(&question)
             }
             Policy::Plugin(name) if self.is_trusted(now, name) => {

@@ -133,20 +133,12 @@ pub(super) async fn measure(seed: u64, runs: usize, pictures: Option<&Path>) -> 
         figures.push(Figure::new(setting.second_frame, second_frame, "ratio", Better::Lower, 1.04));
     }
     eprintln!("{table}");
-    figures.push(Figure::new(
-        "steal_latency_p95_local",
-        percentile(&gaps.local_ms, 0.95),
-        "ms",
-        Better::Lower,
-        5.0,
-    ));
-    figures.push(Figure::new(
-        "steal_latency_p95_global",
-        percentile(&gaps.global_ms, 0.95),
-        "ms",
-        Better::Lower,
-        25.0,
-    ));
+    for (name, gaps_ms, bar_ms) in [
+        ("steal_latency_p95_local", &gaps.local_ms, 5.0),
+        ("steal_latency_p95_global", &gaps.global_ms, 25.0),
+    ] {
+        figures.push(Figure::new(name, percentile(gaps_ms, 0.95), "ms", Better::Lower, bar_ms));
+    }
     Ok(figures)
 }
 
