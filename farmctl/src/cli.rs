@@ -3,6 +3,7 @@
 use std::{path::PathBuf, str::FromStr, time::Duration};
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
+use mi_kernel::generate::RandomAlignment;
 
 use crate::failure::Failure;
 
@@ -118,7 +119,7 @@ pub(crate) struct RenderArgs {
     pub devices: Vec<String>,
 }
 
-#[derive(Debug, Args)]
+#[derive(Clone, Debug, Args)]
 pub(crate) struct MiArgs {
     /// The alignment: FASTA, A3M, A2M, Stockholm, Clustal or one sequence a line; gzip too.
     pub alignment: PathBuf,
@@ -143,6 +144,10 @@ pub(crate) struct MiArgs {
     /// Leaves out columns with gaps in more than this share of the sequences that are left, 0 to 1.
     #[arg(long, value_name = "SHARE", value_parser = share)]
     pub max_gap_share: Option<f64>,
+    /// How gaps count: as a symbol (ormi), or apart: rows with a gap in either column left out of the pair (sumi), out of its
+    /// joint entropy alone (demi), or out of its joint distribution alone (esmi).
+    #[arg(long, value_enum, default_value_t = Gaps::Ormi)]
+    pub gaps: Gaps,
     /// What the farm sends back.
     #[arg(long, value_enum, default_value_t = MiMode::Reduce)]
     pub mode: MiMode,
@@ -158,6 +163,19 @@ pub(crate) struct MiArgs {
     /// Devices of the own farm when no coordinator is given; repeatable.
     #[arg(long = "device", value_name = "SPEC")]
     pub devices: Vec<String>,
+}
+
+/// How gaps count in mutual information (BioPhysConnectoR's names).
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub(crate) enum Gaps {
+    /// A gap is a symbol like all others.
+    Ormi,
+    /// Entropies over the rows with residues in both columns.
+    Sumi,
+    /// Entropies over each column's residues, the joint one over the rows with both.
+    Demi,
+    /// Joint distribution over the rows with residues in both, each column's own over its residues.
+    Esmi,
 }
 
 /// What jobs of `mi` send back; the results are the same.
@@ -279,6 +297,15 @@ pub(crate) struct BenchArgs {
     /// Runs of each measurement, of which the median counts; each bench has its own default.
     #[arg(long, value_parser = clap::value_parser!(u8).range(1..=25))]
     pub runs: Option<u8>,
+    /// The alignment of `mi`; `farmctl alignment list` names them.
+    #[arg(long, value_name = "NAME", default_value = "thesis-a")]
+    pub set: RandomAlignment,
+    /// Devices on which `mi` measures runtime and speed-up; repeatable.
+    #[arg(long = "device", value_name = "SPEC")]
+    pub devices: Vec<String>,
+    /// Most iterations of `mi` on them.
+    #[arg(long, default_value_t = 512, value_parser = clap::value_parser!(u64).range(8..=100_000))]
+    pub iterations: u64,
     /// Where `steal` leaves pictures of its last runs (SVG): figures 5.11 and 5.12 of the thesis.
     #[arg(long, value_name = "FOLDER")]
     pub pictures: Option<PathBuf>,
@@ -305,6 +332,8 @@ pub(crate) enum BenchName {
     Fairness,
     /// Speed-up on equal jobs, by devices and by nodes.
     Scaling,
+    /// Mutual information: runtime over iterations and speed-up on given devices, overhead by simulated nodes.
+    Mi,
 }
 
 /// An image size in pixels, both extents positive.

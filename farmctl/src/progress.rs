@@ -2,6 +2,7 @@
 
 use std::{
     io::IsTerminal as _,
+    sync::Arc,
     time::{Duration, Instant},
 };
 
@@ -9,15 +10,18 @@ use client_sdk::{CoordinatorLink, Progress};
 use farm_core::message::WaitReason;
 use indicatif::{HumanCount, ProgressBar, ProgressStyle as BarStyle};
 use serde_json::json;
-use tokio::sync::watch;
+use tokio::{sync::watch, task::JoinHandle};
 
 use crate::{cli::ProgressStyle, output};
 
 /// Redraws of the bar, and lines of JSON, are at least this far apart.
 const INTERVAL: Duration = Duration::from_millis(100);
 
+/// How often [`Units::early`] is asked at most: it may pass over all that there is.
+const EARLY_INTERVAL: Duration = Duration::from_secs(2);
+
 /// What the bar counts besides jobs.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone)]
 pub(crate) struct Units {
     /// Jobs of the whole run, where known beforehand.
     pub jobs: u64,
@@ -25,21 +29,63 @@ pub(crate) struct Units {
     pub total: f64,
     /// What they are called.
     pub name: &'static str,
+    /// What can be said of the result before the end.
+    pub early: Option<Arc<dyn Fn() -> Option<Early> + Send + Sync>>,
+}
+
+/// A result before the end.
+#[derive(Clone, Debug)]
+pub(crate) struct Early {
+    /// For the bar.
+    pub words: String,
+    /// For the line of JSON: its name and its value.
+    pub field: (&'static str, serde_json::Value),
+}
+
+/// Asks for the early result, not too often and beside the telling.
+struct EarlyTeller {
+    units: Units,
+    asked: Instant,
+    asking: Option<JoinHandle<Option<Early>>>,
+    known: Option<Early>,
+}
+
+impl EarlyTeller {
+    fn new(units: Units) -> Self {
+        Self { units, asked: Instant::now(), asking: None, known: None }
+    }
+
+    /// The latest answer.
+    async fn known(&mut self) -> Option<&Early> {
+        if self.asking.as_ref().is_some_and(JoinHandle::is_finished)
+            && let Some(asking) = self.asking.take()
+        {
+            self.known = asking.await.ok().flatten().or_else(|| self.known.take());
+        }
+        if let Some(early) = self.units.early.clone().filter(|_| self.asking.is_none())
+            && self.asked.elapsed() >= EARLY_INTERVAL
+        {
+            self.asked = Instant::now();
+            self.asking = Some(tokio::task::spawn_blocking(move || early()));
+        }
+        self.known.as_ref()
+    }
 }
 
 /// Tells the progress until the farm's connection closes.
 pub(crate) async fn tell(mut progress: watch::Receiver<Progress>, style: ProgressStyle, units: Units) {
     match style {
         ProgressStyle::None => {}
-        ProgressStyle::Ndjson => tell_lines(&mut progress).await,
+        ProgressStyle::Ndjson => tell_lines(&mut progress, units).await,
         ProgressStyle::Auto if std::io::stderr().is_terminal() => tell_bar(&mut progress, units).await,
         ProgressStyle::Auto => tell_waits(&mut progress).await,
     }
 }
 
-async fn tell_lines(progress: &mut watch::Receiver<Progress>) {
+async fn tell_lines(progress: &mut watch::Receiver<Progress>, units: Units) {
+    let mut early = EarlyTeller::new(units);
     loop {
-        let line = {
+        let mut line = {
             let now = progress.borrow_and_update();
             json!({
                 "event": "progress",
@@ -51,6 +97,9 @@ async fn tell_lines(progress: &mut watch::Receiver<Progress>) {
                 "waiting": now.waiting.map(wait_words),
             })
         };
+        if let Some(Early { field: (name, value), .. }) = early.known().await {
+            line[name] = value.clone();
+        }
         if output::print_text(&format!("{line}\n")).is_err() || progress.changed().await.is_err() {
             return;
         }
@@ -64,12 +113,15 @@ async fn tell_bar(progress: &mut watch::Receiver<Progress>, units: Units) {
         .expect("the template is valid");
     bar.set_style(style);
     let began = Instant::now();
+    let mut early = EarlyTeller::new(units.clone());
     loop {
+        let words = early.known().await.map(|early| early.words.clone());
         {
             let now = progress.borrow_and_update();
             bar.set_position(now.jobs_done.min(units.jobs));
             bar.set_prefix(now.active_tasks.last().map_or("start", |task| &**task).to_owned());
-            bar.set_message(message(&now, units, began.elapsed()));
+            let said = message(&now, &units, began.elapsed());
+            bar.set_message([Some(said), words].into_iter().flatten().collect::<Vec<_>>().join("  "));
         }
         if progress.changed().await.is_err() {
             break;
@@ -94,7 +146,7 @@ async fn tell_waits(progress: &mut watch::Receiver<Progress>) {
     }
 }
 
-fn message(now: &Progress, units: Units, elapsed: Duration) -> String {
+fn message(now: &Progress, units: &Units, elapsed: Duration) -> String {
     if let Some(reason) = now.waiting {
         return format!("waiting: {}", wait_words(reason));
     }
@@ -147,10 +199,10 @@ mod tests {
     #[test]
     fn the_bar_tells_rate_and_remaining_time() {
         let now = Progress { jobs_done: 25, jobs_known: 100, nodes: 3, ..Progress::default() };
-        let units = Units { jobs: 100, total: 1_000_000.0, name: "samples" };
-        assert_eq!(message(&now, units, Duration::from_secs(10)), "25,000 samples/s  ETA 30s  nodes 3");
+        let units = Units { jobs: 100, total: 1_000_000.0, name: "samples", early: None };
+        assert_eq!(message(&now, &units, Duration::from_secs(10)), "25,000 samples/s  ETA 30s  nodes 3");
         let stuck = Progress { waiting: Some(WaitReason::NoNode), ..now };
-        assert!(message(&stuck, units, Duration::from_secs(10)).contains("no node"));
+        assert!(message(&stuck, &units, Duration::from_secs(10)).contains("no node"));
     }
 
     #[test]

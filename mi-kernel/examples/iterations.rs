@@ -123,7 +123,7 @@ fn measure(bench: &mut Bench, arguments: &Arguments, set: &RandomAlignment) -> R
         bounds: name(packed.bounds),
         table: name(packed.table),
         column_terms: name(packed.column_terms),
-        module: name(module_source(shape.symbols()).into_bytes()),
+        module: name(module_source(&shape).into_bytes()),
     };
     let started = Instant::now();
     let pass = MiJob { seed: Seed(1), pass: Pass::Observed };

@@ -5,6 +5,8 @@ use std::fmt;
 
 use thiserror::Error;
 
+use crate::GapMode;
+
 /// Most sequences of one alignment: keeps `N * log2(q) * 2^s` inside 31 bits with 8 fractional bits left.
 pub const MAX_ROWS: usize = 1 << 20;
 
@@ -157,6 +159,7 @@ pub struct Alignment {
     alphabet: Vec<u8>,
     /// The number of each column in the input, from 1.
     numbers: Vec<usize>,
+    gaps: GapMode,
 }
 
 /// One sequence as a format reader delivers it: upper-case letters and [`GAP`] only.
@@ -207,7 +210,7 @@ impl Alignment {
         }
         let (codes, alphabet) = coded(symbols);
         let names = rows.into_iter().map(|row| row.name).collect();
-        Ok(Self { names, codes, alphabet, numbers: (1..=l).collect() })
+        Ok(Self { names, codes, alphabet, numbers: (1..=l).collect(), gaps: GapMode::default() })
     }
 
     /// Some of its sequences and columns, at least one of each, both ascending; the alphabet is what occurs in them.
@@ -219,7 +222,19 @@ impl Alignment {
         let (codes, alphabet) = coded(columns.iter().flat_map(picked).collect());
         let names = rows.iter().map(|row| self.names[*row].clone()).collect();
         let numbers = columns.iter().map(|column| self.numbers[*column]).collect();
-        Self { names, codes, alphabet, numbers }
+        Self { names, codes, alphabet, numbers, gaps: self.gaps }
+    }
+
+    /// The same alignment, its gaps counted in another way.
+    #[must_use]
+    pub fn with_gaps(self, gaps: GapMode) -> Self {
+        Self { gaps, ..self }
+    }
+
+    /// How gaps count. Without any, all ways are one.
+    #[must_use]
+    pub fn gaps(&self) -> GapMode {
+        if self.alphabet.first() == Some(&GAP) { self.gaps } else { GapMode::Ormi }
     }
 
     /// Number of sequences, N; at least 2.

@@ -7,7 +7,7 @@
 pub const MAX_SCALE_BITS: u32 = 14;
 
 /// Fractional bits of [`log2_q57`].
-const LOG_BITS: u32 = 57;
+pub(crate) const LOG_BITS: u32 = 57;
 
 /// The table of `T(c) * 2^s` for c = 0..=N, modulo 2^32.
 ///
@@ -43,20 +43,13 @@ impl FixedPoint {
     pub fn sum(&self, counts: &[u32]) -> u32 {
         counts.iter().fold(0u32, |sum, count| sum.wrapping_add(self.table[*count as usize]))
     }
-
-    /// A score `X = N * MI * 2^s` in bits of mutual information.
-    #[must_use]
-    pub fn bits(&self, score: f64) -> f64 {
-        let n = self.table.len() as f64 - 1.0;
-        score / (n * f64::from(1u32 << self.scale_bits))
-    }
 }
 
 /// The largest s up to [`MAX_SCALE_BITS`] with `N * log2(q) * 2^s` below 2^31.
 ///
 /// The design gives `min(14, 31 - ceil(log2(N * log2 q)))`. That is the same, but where `N * log2 q` is a power of two
 /// (N = 32,768 and q = 16) it lets X reach 2^31 itself; the rounding of the `(q + 1)^2` terms is kept free here too.
-fn scale_bits(n: u32, q: u32) -> Option<u32> {
+pub(crate) fn scale_bits(n: u32, q: u32) -> Option<u32> {
     let rounding = u128::from(q + 1) * u128::from(q + 1) / 2 + 1;
     let most = u128::from(n) * u128::from(log2_q57(u64::from(q.max(1))));
     (0..=MAX_SCALE_BITS).rev().find(|s| ((most << s) >> LOG_BITS) + rounding < 1 << 31)

@@ -11,8 +11,8 @@ use std::{
 };
 
 use client_sdk::{
-    Content, DispatchError, Job, JobProgram, JobResult, NodeId, RetrieveError, Task, TaskData, TaskError,
-    TaskGraph, TaskProgress,
+    Content, DispatchError, Job, JobProgram, JobResult, NodeId, Requirements, RetrieveError,
+    SimulatedDevices, Task, TaskData, TaskError, TaskGraph, TaskProgress,
 };
 use thiserror::Error;
 
@@ -65,6 +65,8 @@ pub struct MiOptions {
     pub mode: Mode,
     /// Sums of an earlier run; the iterations in them are not computed again.
     pub earlier: Option<Accumulators>,
+    /// Accepted only where the result does not matter, as in a bench of the farm: it is zeros then.
+    pub simulated: SimulatedDevices,
 }
 
 /// A run that cannot start.
@@ -127,6 +129,17 @@ impl MiHandle {
         self.shared.observed.get().cloned()
     }
 
+    /// Iterations in the sums so far, and the pair with the highest Z in them (columns' numbers in the input); a pass over all
+    /// pairs, in which no result is taken.
+    #[must_use]
+    pub fn leading(&self) -> Option<(usize, [usize; 2], f64)> {
+        let observed = self.shared.observed.get()?;
+        let sums = self.shared.sums();
+        let (pair, z) = sums.leading(observed)?;
+        let number = |column| self.shared.alignment.number(column);
+        Some((sums.iterations(), [number(pair.i), number(pair.j)], z))
+    }
+
     /// The sums of what has come so far: complete after the run, valid at any time.
     #[must_use]
     pub fn sums(&self) -> Accumulators {
@@ -141,7 +154,7 @@ impl MiHandle {
 pub fn mi_graph(alignment: Arc<Alignment>, options: MiOptions) -> Result<(TaskGraph, MiHandle), MiError> {
     let shape = Shape::new(&alignment)?;
     Reference::unscored(&alignment)?;
-    let MiOptions { iterations, seed, mode, earlier } = options;
+    let MiOptions { iterations, seed, mode, earlier, simulated } = options;
     if iterations > MAX_ITERATIONS {
         return Err(MiError::Iterations { iterations });
     }
@@ -163,8 +176,9 @@ pub fn mi_graph(alignment: Arc<Alignment>, options: MiOptions) -> Result<(TaskGr
         sums: Mutex::new(sums),
         nodes: Mutex::new(BTreeSet::new()),
     });
-    let observed = ObservedTask { shared: Arc::clone(&shared) };
-    let null = NullTask { ranges, seed, mode, shared: Arc::clone(&shared) };
+    let needs = Requirements { simulated, ..Requirements::ANY };
+    let observed = ObservedTask { needs, shared: Arc::clone(&shared) };
+    let null = NullTask { needs, ranges, seed, mode, shared: Arc::clone(&shared) };
     let graph =
         TaskGraph::new().task(OBSERVED_TASK, observed).task(NULL_TASK, null).after(NULL_TASK, OBSERVED_TASK);
     Ok((graph, MiHandle { shared, jobs }))
@@ -182,12 +196,15 @@ fn job_iterations(shape: &Shape, mode: Mode, iterations: u64) -> u64 {
     long.min(iterations.div_ceil(LEAST_JOBS)).min(JOB_ITERATIONS).min(commands).min(held).max(1)
 }
 
-/// The iterations of `0..iterations` that are not in the sums, in ranges of at most `most`.
+/// The iterations of `0..iterations` that are not in the sums, in ranges of at most `most`, and of a quarter of it in the
+/// last eighth: devices that end at different times wait for a short job.
 fn missing(sums: &Accumulators, iterations: u64, most: u64) -> VecDeque<Range<u64>> {
     let mut ranges = VecDeque::new();
     let mut start = 0;
+    let last_eighth = iterations - iterations / 8;
     for held in sums.maxima().keys().copied().chain([iterations]) {
         while start < held {
+            let most = if start < last_eighth { most } else { most.div_ceil(4) };
             let end = held.min(start + most);
             ranges.push_back(start..end);
             start = end;
@@ -233,10 +250,15 @@ fn out_of_order(task: &str) -> DispatchError {
 /// Packs the alignment and scores it as it is.
 #[derive(Debug)]
 struct ObservedTask {
+    needs: Requirements,
     shared: Arc<Shared>,
 }
 
 impl Task for ObservedTask {
+    fn requirements(&self) -> Requirements {
+        self.needs
+    }
+
     fn prepare(&mut self, data: &mut TaskData) -> Result<(), TaskError> {
         let reference = Reference::unscored(&self.shared.alignment).map_err(TaskError::application)?;
         let packed = PackedAlignment::new(&reference, &self.shared.shape);
@@ -246,7 +268,7 @@ impl Task for ObservedTask {
             bounds: data.allocation(packed.bounds),
             table: data.allocation(packed.table),
             column_terms: data.allocation(packed.column_terms),
-            module: data.module(module_source(self.shared.shape.symbols())),
+            module: data.module(module_source(&self.shared.shape)),
         };
         self.shared
             .contents
@@ -284,6 +306,7 @@ impl Job for ObservedJob {
 /// The iterations.
 #[derive(Debug)]
 struct NullTask {
+    needs: Requirements,
     ranges: VecDeque<Range<u64>>,
     seed: Seed,
     mode: Mode,
@@ -315,6 +338,10 @@ impl NullTask {
 }
 
 impl Task for NullTask {
+    fn requirements(&self) -> Requirements {
+        self.needs
+    }
+
     fn prepare(&mut self, data: &mut TaskData) -> Result<(), TaskError> {
         let observed =
             self.shared.observed.get().ok_or_else(|| TaskError::application("nothing was scored"))?;
@@ -370,7 +397,13 @@ mod tests {
     use crate::{NullModel, ShuffleKind, parse};
 
     fn options(iterations: u64, earlier: Option<Accumulators>) -> MiOptions {
-        MiOptions { iterations, seed: Seed(1), mode: Mode::Reduce, earlier }
+        MiOptions {
+            iterations,
+            seed: Seed(1),
+            mode: Mode::Reduce,
+            earlier,
+            simulated: SimulatedDevices::Refused,
+        }
     }
 
     #[test]

@@ -24,6 +24,7 @@ mod alignment;
 mod filter;
 mod fixed_point;
 mod formats;
+mod gaps;
 pub mod generate;
 pub mod gpu;
 pub mod histogram;
@@ -41,6 +42,7 @@ pub use self::{
     filter::{FilterError, Filters},
     fixed_point::{FixedPoint, MAX_SCALE_BITS, log2_q57},
     formats::{Format, MAX_LINE_BYTES, Parsed, ParsingNotes, parse, parse_as},
+    gaps::{GapMode, SCORE_BITS},
     null_model::{Accumulators, NullModel, NullModelError, PairStatistics},
     philox::philox4x32_10,
     reference::{PairIndex, Reference, ReferenceError, pair_count},

@@ -211,6 +211,24 @@ impl Accumulators {
         &self.maxima
     }
 
+    /// The pair with the highest Z so far, as a run goes on: `observed` holds the observed scores. `None` while no pair's null
+    /// model varies.
+    ///
+    /// # Panics
+    /// There is not one observed score for each pair.
+    #[must_use]
+    pub fn leading(&self, observed: &[i32]) -> Option<(PairIndex, f64)> {
+        assert_eq!(observed.len(), self.sum.len(), "one score for each pair");
+        let z = |place: usize| {
+            let (mean, sd) = moments(self.sum[place], self.sum_of_squares[place], self.iterations());
+            (sd > 0.0).then(|| (f64::from(observed[place]) - mean) / sd)
+        };
+        PairIndex::all(self.l)
+            .enumerate()
+            .filter_map(|(place, pair)| Some((pair, z(place)?)))
+            .max_by(|(_, first), (_, second)| first.total_cmp(second))
+    }
+
     /// What the sums say about each pair, in order.
     ///
     /// # Panics
@@ -220,7 +238,6 @@ impl Accumulators {
         let reference = null.reference;
         assert_eq!(self.l, reference.alignment().l(), "sums and null model are of one alignment");
         let runs = self.iterations();
-        let fixed_point = reference.fixed_point();
         PairIndex::all(self.l)
             .enumerate()
             .map(|(place, PairIndex { i, j })| {
@@ -231,9 +248,9 @@ impl Accumulators {
                 PairStatistics {
                     i,
                     j,
-                    mi_bits: fixed_point.bits(f64::from(observed)),
-                    null_mean_bits: fixed_point.bits(mean),
-                    null_sd_bits: fixed_point.bits(sd),
+                    mi_bits: reference.bits(f64::from(observed)),
+                    null_mean_bits: reference.bits(mean),
+                    null_sd_bits: reference.bits(sd),
                     z: if undefined { 0.0 } else { distance / sd },
                     z_undefined: undefined,
                     p: (1.0 + f64::from(self.at_least_observed[place])) / (runs as f64 + 1.0),

@@ -17,7 +17,7 @@ const CLIP_SHARE: f64 = 0.995;
 #[must_use]
 pub fn matrices(reference: &Reference<'_>, pairs: &[PairStatistics]) -> [(&'static str, Vec<f64>); 5] {
     let l = reference.alignment().l();
-    let entropy = |column: usize| reference.fixed_point().bits(f64::from(reference.entropy(column)));
+    let entropy = |column: usize| reference.bits(f64::from(reference.entropy(column)));
     let fill = |diagonal: &dyn Fn(usize) -> f64, value: fn(&PairStatistics) -> f64| {
         let mut matrix = vec![0.0; l * l];
         for column in 0..l {

@@ -3,7 +3,10 @@
 
 use thiserror::Error;
 
-use crate::{Alignment, FixedPoint};
+use crate::{
+    Alignment, FixedPoint, GapMode, SCORE_BITS,
+    gaps::{ColumnTerms, residue_entropy},
+};
 
 /// Most pairs the host holds at once (8 GiB of accumulators); a kernel splits its accumulators over bindings instead.
 const MAX_PAIRS: usize = 1 << 28;
@@ -65,14 +68,16 @@ pub fn pair_count(l: usize) -> usize {
     l * l.saturating_sub(1) / 2
 }
 
-/// An alignment with its table and observed scores `X(i,j) = N * MI(i,j) * 2^s`.
+/// An alignment with its table and observed scores: `X(i,j) = N * MI(i,j) * 2^s`, or `MI(i,j) * 2^`[`SCORE_BITS`] where gaps
+/// stand apart.
 #[derive(Clone, Debug)]
 pub struct Reference<'a> {
     alignment: &'a Alignment,
     fixed_point: FixedPoint,
-    /// `sum_a T(c_a)` of each column: shuffling does not change it.
-    column_terms: Vec<u32>,
-    /// Which columns hold one symbol only.
+    column_terms: ColumnTerms,
+    /// The diagonal, as scores.
+    entropies: Vec<i32>,
+    /// Which columns hold one symbol only, or one residue where gaps stand apart.
     constant: Vec<bool>,
     observed: Vec<i32>,
 }
@@ -114,21 +119,45 @@ impl<'a> Reference<'a> {
             return Err(ReferenceError::Pairs { l, limit: MAX_PAIRS });
         }
         let sizes = u32::try_from(n).ok().zip(u32::try_from(q).ok());
-        let fixed_point =
-            sizes.and_then(|(n, q)| FixedPoint::new(n, q)).ok_or(ReferenceError::Scale { n, q })?;
+        let fixed_point = sizes
+            .and_then(|(n, q)| FixedPoint::new(n, alignment.gaps().scale_symbols(q)))
+            .ok_or(ReferenceError::Scale { n, q })?;
         let compositions: Vec<Vec<u32>> =
             (0..l).map(|column| composition(alignment.column(column), q)).collect();
-        let column_terms = compositions.iter().map(|counts| fixed_point.sum(counts)).collect();
+        let column_terms = ColumnTerms::new(alignment.gaps(), &fixed_point, &compositions);
+        let all_rows = fixed_point.table()[n];
+        let (entropies, uncounted) = match alignment.gaps() {
+            GapMode::Ormi => {
+                // sum T(c_aa) is the column's own term, so one of the two subtracted terms cancels.
+                let own = |counts: &Vec<u32>| all_rows.wrapping_sub(fixed_point.sum(counts)).cast_signed();
+                (compositions.iter().map(own).collect(), 0)
+            }
+            GapMode::Sumi | GapMode::Demi | GapMode::Esmi => {
+                (compositions.iter().map(|counts| residue_entropy(counts)).collect(), 1)
+            }
+        };
         let constant = compositions
             .iter()
-            .map(|counts| counts.iter().filter(|count| **count > 0).count() == 1)
+            .map(|counts| counts[uncounted..].iter().filter(|count| **count > 0).count() <= 1)
             .collect();
-        Ok(Self { alignment, fixed_point, column_terms, constant, observed: Vec::new() })
+        Ok(Self { alignment, fixed_point, column_terms, entropies, constant, observed: Vec::new() })
     }
 
-    /// `sum_a T(c_a)` of each column.
-    pub(crate) fn column_terms(&self) -> &[u32] {
+    /// What each column adds to its pairs' scores.
+    pub(crate) fn column_terms(&self) -> &ColumnTerms {
         &self.column_terms
+    }
+
+    /// A score in bits of mutual information.
+    #[must_use]
+    pub fn bits(&self, score: f64) -> f64 {
+        match self.alignment.gaps() {
+            GapMode::Ormi => {
+                let rows = self.alignment.n() as f64;
+                score / (rows * f64::from(1_u32 << self.fixed_point.scale_bits()))
+            }
+            GapMode::Sumi | GapMode::Demi | GapMode::Esmi => score / f64::from(1_u32 << SCORE_BITS),
+        }
     }
 
     /// The alignment.
@@ -164,8 +193,7 @@ impl<'a> Reference<'a> {
     /// `column` is not below L.
     #[must_use]
     pub fn entropy(&self, column: usize) -> i32 {
-        // sum T(c_aa) is the column's own term, so one of the two subtracted terms cancels.
-        self.all_rows_term().wrapping_sub(self.column_terms[column]).cast_signed()
+        self.entropies[column]
     }
 
     /// The L x L matrix of mutual information in bits, row by row, entropies on the diagonal.
@@ -174,10 +202,10 @@ impl<'a> Reference<'a> {
         let l = self.alignment.l();
         let mut matrix = vec![0.0; l * l];
         for column in 0..l {
-            matrix[column * l + column] = self.fixed_point.bits(f64::from(self.entropy(column)));
+            matrix[column * l + column] = self.bits(f64::from(self.entropy(column)));
         }
         for (pair, score) in PairIndex::all(l).zip(&self.observed) {
-            let bits = self.fixed_point.bits(f64::from(*score));
+            let bits = self.bits(f64::from(*score));
             matrix[pair.i * l + pair.j] = bits;
             matrix[pair.j * l + pair.i] = bits;
         }
@@ -195,20 +223,10 @@ impl<'a> Reference<'a> {
                 for (a, b) in first.iter().zip(*second) {
                     joint[usize::from(*a) * q + usize::from(*b)] += 1;
                 }
-                let score = self
-                    .fixed_point
-                    .sum(&joint)
-                    .wrapping_sub(self.column_terms[i])
-                    .wrapping_sub(self.column_terms[j])
-                    .wrapping_add(self.all_rows_term());
-                *scores.next().expect("one score for each pair") = score.cast_signed();
+                let score = self.column_terms.score(&self.fixed_point, &joint, i, j);
+                *scores.next().expect("one score for each pair") = score;
             }
         }
-    }
-
-    /// `T(N)`.
-    fn all_rows_term(&self) -> u32 {
-        self.fixed_point.table()[self.alignment.n()]
     }
 }
 

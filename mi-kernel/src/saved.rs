@@ -1,6 +1,6 @@
 //! Sums as a file keeps them, so that a later run goes on where this one ended. Little-endian, with a digest at the end.
 //!
-//! Layout: magic, digest of the alignment, n, l, q, scale bits (u32 each), seed (u64), number of iterations (u64); then for
+//! Layout: magic, digest of the alignment, n, l, q, scale bits and, in the second byte of the same word, how gaps count (u32 each), seed (u64), number of iterations (u64); then for
 //! each iteration its number (u64) and largest score (i32); then sums (i64), sums of squares (u64) and counts (u32) of all
 //! pairs; then blake3 of all before.
 
@@ -8,7 +8,7 @@ use std::collections::BTreeMap;
 
 use thiserror::Error;
 
-use crate::{Accumulators, Alignment, FixedPoint, NullModelError, Seed, pair_count};
+use crate::{Accumulators, Alignment, GapMode, NullModelError, Seed, fixed_point::scale_bits, pair_count};
 
 const MAGIC: &[u8; 8] = b"GLEANMI1";
 const DIGEST_BYTES: usize = 32;
@@ -27,7 +27,7 @@ pub enum SavedError {
     /// Sums of something else.
     #[error("the sums are of another {what}")]
     Other {
-        /// `alignment` or `seed`.
+        /// `alignment`, `seed` or `way of counting gaps`.
         what: &'static str,
     },
     /// Parts that do not fit.
@@ -51,10 +51,17 @@ pub fn alignment_digest(alignment: &Alignment) -> [u8; DIGEST_BYTES] {
 fn header(alignment: &Alignment, seed: Seed, iterations: usize) -> Vec<u8> {
     let narrow = |value: usize| u32::try_from(value).expect("an alignment's sizes are bounded");
     let sizes = [alignment.n(), alignment.l(), alignment.q()].map(narrow);
-    let scale = FixedPoint::new(sizes[0], sizes[2]).map_or(0, |fixed| fixed.scale_bits());
+    let gaps = alignment.gaps();
+    let scale = scale_bits(sizes[0], gaps.scale_symbols(sizes[2])).unwrap_or(0);
+    let mode = match gaps {
+        GapMode::Ormi => 0,
+        GapMode::Sumi => 1,
+        GapMode::Demi => 2,
+        GapMode::Esmi => 3,
+    };
     let mut bytes = MAGIC.to_vec();
     bytes.extend(alignment_digest(alignment));
-    for word in [sizes[0], sizes[1], sizes[2], scale] {
+    for word in [sizes[0], sizes[1], sizes[2], scale | mode << 8] {
         bytes.extend(word.to_le_bytes());
     }
     bytes.extend(seed.0.to_le_bytes());
@@ -96,8 +103,12 @@ pub fn load(alignment: &Alignment, seed: Seed, bytes: &[u8]) -> Result<Accumulat
     if blake3::hash(body).as_bytes() != digest {
         return Err(SavedError::Damaged { at: body.len(), what: "the digest is not that of the bytes" });
     }
-    if body[..seed_at] != expected[..seed_at] {
+    let scale_at = seed_at - 4;
+    if body[..scale_at] != expected[..scale_at] {
         return Err(SavedError::Other { what: "alignment" });
+    }
+    if body[scale_at..seed_at] != expected[scale_at..seed_at] {
+        return Err(SavedError::Other { what: "way of counting gaps" });
     }
     if body[seed_at..seed_at + 8] != expected[seed_at..seed_at + 8] {
         return Err(SavedError::Other { what: "seed" });
@@ -158,6 +169,11 @@ mod tests {
         assert_eq!(load(&alignment, Seed(4), &bytes), Err(SavedError::Other { what: "seed" }));
         let other = parse(b"ACA\nACC\nGTA\nGTA\n").unwrap().alignment;
         assert_eq!(load(&other, Seed(3), &bytes), Err(SavedError::Other { what: "alignment" }));
+        let gappy = parse(b"A-A\nACC\nGTA\nGTC\n").unwrap().alignment;
+        let [symbol, apart] = [GapMode::Ormi, GapMode::Sumi].map(|gaps| gappy.clone().with_gaps(gaps));
+        let of_symbol = save(&symbol, Seed(3), &sums);
+        let error = load(&apart, Seed(3), &of_symbol).unwrap_err();
+        assert_eq!(error, SavedError::Other { what: "way of counting gaps" });
         for at in 0..bytes.len() {
             let mut damaged = bytes.clone();
             damaged[at] ^= 1;

@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use device::Device;
 use mi_kernel::{
-    Alignment, NullModel, Reference, Seed, ShuffleKind,
+    Alignment, GapMode, NullModel, Reference, Seed, ShuffleKind,
     gpu::{Method, MiJob, Pass, Shape},
     parse,
 };
@@ -60,6 +60,26 @@ fn random_alignments_give_the_hosts_bits() {
         Ok(())
     });
     outcome.unwrap_or_else(|error| panic!("{error}"));
+}
+
+#[test]
+fn gaps_that_stand_apart_give_the_hosts_bits() {
+    let device = Device::open(COARSE);
+    for (n, l, kinds, seed) in [(40, 9, 4, 2), (1_030, 7, 27, 4)] {
+        let gappy = alignment(n, l, kinds, seed);
+        let mut seen = Vec::new();
+        for gaps in [GapMode::Sumi, GapMode::Demi, GapMode::Esmi] {
+            let alignment = gappy.clone().with_gaps(gaps);
+            assert_eq!(alignment.gaps(), gaps, "the set has gaps");
+            let reference = Reference::new(&alignment).unwrap();
+            let shape = Shape::with_binding_bytes(&alignment, 20_000).unwrap();
+            assert_eq!(device.observed(&reference, &shape), reference.observed(), "{gaps:?}, {n} x {l}");
+            let host = NullModel::new(&reference, Seed(seed), ShuffleKind::Feistel).run(0..3).unwrap();
+            assert!(device.sums(&reference, &shape, &reduce(seed, 0..3)) == host, "{gaps:?}, {n} x {l}");
+            seen.push(host);
+        }
+        assert!(seen[0] != seen[1] && seen[1] != seen[2], "the ways differ: {n} x {l}");
+    }
 }
 
 #[test]

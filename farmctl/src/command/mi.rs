@@ -9,20 +9,20 @@ use std::{
 };
 
 use anyhow::{Context as _, anyhow};
-use client_sdk::{FarmError, FarmOptions, RunSummary};
+use client_sdk::{FarmError, FarmOptions, RunSummary, SimulatedDevices};
 use mi_kernel::{
-    Accumulators, Alignment, Filters, NullModel, Reference, Seed, ShuffleKind, histogram,
+    Accumulators, Alignment, Filters, GapMode, NullModel, Reference, Seed, ShuffleKind, histogram,
     job::{MiHandle, MiOptions, Mode, mi_graph},
     output, parse, saved,
 };
 use serde_json::json;
 
 use crate::{
-    cli::{MiArgs, MiMode, ProgressStyle},
+    cli::{Gaps, MiArgs, MiMode, ProgressStyle},
     embedded::EmbeddedFarm,
     failure::Failure,
     output::print_text,
-    progress::Units,
+    progress::{Early, Units},
     running::{Stops, run_graph},
 };
 
@@ -48,7 +48,12 @@ struct Input {
 /// Computes; the exit code is 0 only when every iteration is in the results.
 pub(crate) async fn run(arguments: &MiArgs, coordinator: Option<&str>) -> Result<(), Failure> {
     let mut stops = Stops::listen()?;
-    let input = read(arguments)?;
+    let reading = arguments.clone();
+    // Reading ends by itself, or with the process.
+    let input = tokio::select! {
+        input = tokio::task::spawn_blocking(move || read(&reading)) => input.context("reading panicked")??,
+        () = stops.recv() => return Err(anyhow!("interrupted before the first job: nothing was written").into()),
+    };
     let options = MiOptions {
         iterations: arguments.iterations,
         seed: Seed(arguments.seed),
@@ -57,6 +62,7 @@ pub(crate) async fn run(arguments: &MiArgs, coordinator: Option<&str>) -> Result
             MiMode::Matrix => Mode::Matrix,
         },
         earlier: input.earlier.clone(),
+        simulated: SimulatedDevices::Refused,
     };
     let before = input.earlier.as_ref().map_or(0, Accumulators::iterations);
     let (graph, handle) =
@@ -75,6 +81,7 @@ pub(crate) async fn run(arguments: &MiArgs, coordinator: Option<&str>) -> Result
         jobs: handle.jobs(),
         total: arguments.iterations.saturating_sub(before as u64) as f64,
         name: "iterations",
+        early: Some(early_z(handle.clone())),
     };
     let name = arguments.alignment.file_name().unwrap_or(arguments.alignment.as_os_str());
     let farm = FarmOptions {
@@ -90,6 +97,17 @@ pub(crate) async fn run(arguments: &MiArgs, coordinator: Option<&str>) -> Result
         }
     }
     ended
+}
+
+/// The pair that leads while the run goes on.
+fn early_z(handle: MiHandle) -> Arc<dyn Fn() -> Option<Early> + Send + Sync> {
+    Arc::new(move || {
+        let (iterations, [i, j], z) = handle.leading()?;
+        Some(Early {
+            words: format!("Z {z:.1} ({i}, {j})"),
+            field: ("leading", json!({ "i": i, "j": j, "z": z, "iterations": iterations })),
+        })
+    })
 }
 
 fn shown(path: &Path) -> String {
@@ -118,6 +136,12 @@ fn read(arguments: &MiArgs) -> Result<Input, Failure> {
     if [alignment.n(), alignment.l()] != read {
         eprintln!("farmctl: the filters leave {alignment}");
     }
+    let alignment = alignment.with_gaps(match arguments.gaps {
+        Gaps::Ormi => GapMode::Ormi,
+        Gaps::Sumi => GapMode::Sumi,
+        Gaps::Demi => GapMode::Demi,
+        Gaps::Esmi => GapMode::Esmi,
+    });
     fs::create_dir_all(&arguments.folder).with_context(|| shown(&arguments.folder))?;
     let path = arguments.folder.join(SUMS);
     let earlier = match (fs::read(&path), arguments.extend) {
@@ -201,7 +225,7 @@ async fn finish(
         "column_numbers": column_numbers(input),
         "alphabet": String::from_utf8_lossy(input.alignment.alphabet()),
         "gap_share": input.alignment.gap_share(),
-        "gaps": "an ordinary symbol (ORMI)",
+        "gaps": gap_words(arguments.gaps),
         "units": "bits",
         "seed": arguments.seed,
         "iterations": done,
@@ -227,6 +251,15 @@ async fn finish(
         return Err(failure);
     }
     tell(&summary, arguments, done - before, &best)
+}
+
+fn gap_words(gaps: Gaps) -> &'static str {
+    match gaps {
+        Gaps::Ormi => "an ordinary symbol (ORMI)",
+        Gaps::Sumi => "rows with a gap in either column left out of a pair (SUMI)",
+        Gaps::Demi => "own entropies over residues, joint entropies over rows with both (DEMI)",
+        Gaps::Esmi => "own distributions over residues, joint distributions over rows with both (ESMI)",
+    }
 }
 
 /// Which columns of the input the matrices are of, from 1; nothing where it is all of them.

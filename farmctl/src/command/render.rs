@@ -58,6 +58,7 @@ pub(crate) async fn run(arguments: &RenderArgs, coordinator: Option<&str>) -> Re
         jobs: plan.tile_jobs() + u64::from(plan.light_jobs()),
         total: plan.total_samples() as f64,
         name: "samples",
+        early: None,
     };
     let mut farm = FarmOptions::new(&address, app_name(&arguments.scene));
     farm.policy.clone_from(&arguments.policy);

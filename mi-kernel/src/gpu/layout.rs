@@ -33,7 +33,7 @@ pub(super) const WORDS_A_LANE: u32 = 8;
 /// Words before the first column's round keys.
 pub(super) const KEYS_HEADER: u64 = 8;
 
-/// `Sizes` in WGSL. 32 B.
+/// `Sizes` in WGSL. 48 B.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Pod, Zeroable)]
 pub(super) struct Sizes {
@@ -45,6 +45,8 @@ pub(super) struct Sizes {
     pub(super) left_bits: u32,
     pub(super) right_bits: u32,
     pub(super) plane_words: u32,
+    pub(super) scale_bits: u32,
+    pub(super) padding: [u32; 3],
 }
 
 /// `Chunk` in WGSL. 32 B.

@@ -9,24 +9,40 @@ mod pack;
 
 use std::fmt::Write as _;
 
+use crate::GapMode;
+
 pub use self::{
     job::{DecodeError, MiJob, Pass},
     pack::{AlignmentContents, Chunk, MAX_KERNEL_ROWS, Method, PackedAlignment, Shape, ShapeError},
 };
 
-/// The WGSL text for `q` symbols: one self-contained module, one file per stage.
+/// The WGSL text for a shape's alphabet and gaps: one self-contained module, one file per stage.
 #[must_use]
-pub fn module_source(q: u32) -> String {
+pub fn module_source(shape: &Shape) -> String {
     const TEXT: &str = concat!(
         include_str!("../shaders/layout.wgsl"),
         include_str!("../shaders/permutation.wgsl"),
         include_str!("../shaders/shuffle.wgsl"),
         include_str!("../shaders/count.wgsl"),
     );
-    let mut text = String::with_capacity(TEXT.len() + 32);
+    const GAPS_APART: &str = include_str!("../shaders/gaps_apart.wgsl");
+    let q = shape.symbols();
+    let mut text = String::with_capacity(TEXT.len() + GAPS_APART.len() + 32);
     // A constant, not an override: it sizes workgroup memory.
     writeln!(text, "const SYMBOLS: u32 = {}u;", q.max(1)).expect("a string takes any text");
     text.push_str(TEXT);
+    let mode = match shape.gaps() {
+        GapMode::Ormi => None,
+        GapMode::Sumi => Some("SUMI"),
+        GapMode::Demi => Some("DEMI"),
+        GapMode::Esmi => Some("ESMI"),
+    };
+    if let Some(mode) = mode {
+        writeln!(text, "const GAPS: u32 = {mode};").expect("a string takes any text");
+        text.push_str(GAPS_APART);
+        return text;
+    }
+    text.push_str(include_str!("../shaders/gaps_counted.wgsl"));
     if pack::PLANES_SYMBOLS.contains(&q) {
         text.push_str(include_str!("../shaders/planes.wgsl"));
         text.push_str(&joint_planes(q));

@@ -4,7 +4,7 @@ use farm_core::program::Content;
 use thiserror::Error;
 
 use super::layout::{BLOCK_COLUMNS, ChunkRange, Sizes};
-use crate::{Alignment, Reference, pair_count};
+use crate::{Alignment, GapMode, Reference, fixed_point::scale_bits, pair_count};
 
 /// Most sequences of one pass: two counts share a 32-bit word.
 pub const MAX_KERNEL_ROWS: usize = 65_535;
@@ -76,6 +76,7 @@ pub struct Shape {
     pub(super) q: u32,
     pub(super) chunks: Vec<Chunk>,
     pub(super) method: Method,
+    pub(super) gaps: GapMode,
 }
 
 /// How pairs are counted; the scores are the same.
@@ -88,9 +89,9 @@ pub enum Method {
 }
 
 impl Method {
-    /// The quicker one for an alphabet of `q` symbols.
-    fn of(q: u32) -> Self {
-        if PLANES_SYMBOLS.contains(&q) { Self::Planes } else { Self::Histograms }
+    /// The quicker one for an alphabet of `q` symbols; bit planes know no gaps that stand apart.
+    fn of(q: u32, gaps: GapMode) -> Self {
+        if gaps == GapMode::Ormi && PLANES_SYMBOLS.contains(&q) { Self::Planes } else { Self::Histograms }
     }
 }
 
@@ -143,7 +144,8 @@ impl Shape {
             first_place += pairs;
         }
         let q = narrow(alignment.q());
-        Ok(Self { n: narrow(n), l: narrow(l), q, chunks, method: Method::of(q) })
+        let gaps = alignment.gaps();
+        Ok(Self { n: narrow(n), l: narrow(l), q, chunks, method: Method::of(q, gaps), gaps })
     }
 
     /// The shape with histograms also for a small alphabet: to compare the two.
@@ -176,6 +178,12 @@ impl Shape {
         self.q
     }
 
+    /// How gaps count.
+    #[must_use]
+    pub fn gaps(&self) -> GapMode {
+        self.gaps
+    }
+
     /// The parts of the pairs that share bindings.
     #[must_use]
     pub fn chunks(&self) -> &[Chunk] {
@@ -194,6 +202,9 @@ impl Shape {
             left_bits: bits / 2,
             right_bits: bits - bits / 2,
             plane_words: self.n.div_ceil(32),
+            // An alignment without a scale has no reference, and no job.
+            scale_bits: scale_bits(self.n, self.gaps.scale_symbols(self.q)).unwrap_or(0),
+            padding: [0; 3],
         }
     }
 
@@ -230,7 +241,7 @@ pub struct PackedAlignment {
     pub bounds: Vec<u8>,
     /// The fixed-point table.
     pub table: Vec<u8>,
-    /// Each column's own term.
+    /// What each column adds to its pairs' scores.
     pub column_terms: Vec<u8>,
 }
 
@@ -258,7 +269,7 @@ impl PackedAlignment {
             orders,
             bounds: bytemuck::cast_slice(&bounds).to_vec(),
             table: bytemuck::cast_slice(reference.fixed_point().table()).to_vec(),
-            column_terms: bytemuck::cast_slice(reference.column_terms()).to_vec(),
+            column_terms: bytemuck::cast_slice(reference.column_terms().words()).to_vec(),
         }
     }
 }
@@ -292,7 +303,7 @@ pub struct AlignmentContents {
     pub table: Content,
     /// [`PackedAlignment::column_terms`].
     pub column_terms: Content,
-    /// [`super::module_source`] of the alphabet's size.
+    /// [`super::module_source`] of the shape.
     pub module: Content,
 }
 

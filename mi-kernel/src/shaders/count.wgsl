@@ -1,6 +1,7 @@
 // Scores of pairs: a workgroup is one column i times 256 columns j, a lane owns four of them and a histogram of its own.
 // The rows come grouped by the symbol of column i, so the histogram is that of one symbol: no atomics, no barriers, and
-// no difference between conserved and random columns. Twin: src/reference.rs (score_pairs).
+// no difference between conserved and random columns. What is made of the counts is gaps_counted.wgsl's or
+// gaps_apart.wgsl's. Twin: src/reference.rs (score_pairs).
 
 // Two columns a word: n is below 65,536.
 var<workgroup> histogram: array<u32, SYMBOLS * 128u>;
@@ -47,29 +48,15 @@ fn rows_at(at: u32) -> vec4<u32> {
     return vec4<u32>(grouped[at], grouped[at + 1u], grouped[at + 2u], grouped[at + 3u]);
 }
 
-// Adds T over the histogram and empties it.
-fn flush(lane: u32) -> vec4<u32> {
-    var total = vec4<u32>();
-    for (var symbol = 0u; symbol < SYMBOLS; symbol += 1u) {
-        let at = symbol * 128u + lane;
-        let low = histogram[at];
-        let high = histogram[at + 64u];
-        histogram[at] = 0u;
-        histogram[at + 64u] = 0u;
-        total += vec4<u32>(table[low & 0xffffu], table[low >> 16u], table[high & 0xffffu], table[high >> 16u]);
-    }
-    return total;
-}
-
-// sum_ab T(c_ab) of column i with the four columns of a word.
-fn joint_terms(local_i: u32, word: u32, lane: u32) -> vec4<u32> {
+// What the counts of column i with the four columns of a word come to.
+fn tally_of(local_i: u32, word: u32, lane: u32) -> Tally {
     let base = local_i * sizes.order_words;
     let i = chunk.first_i + local_i;
-    var total = vec4<u32>();
+    var tally = Tally();
     for (var symbol = 0u; symbol < SYMBOLS; symbol += 1u) {
         var place = bounds[i * (SYMBOLS + 1u) + symbol];
         let end = bounds[i * (SYMBOLS + 1u) + symbol + 1u];
-        if place == end {
+        if place == end && skips_if_empty(symbol) {
             continue;
         }
         if (place & 1u) == 1u {
@@ -102,9 +89,9 @@ fn joint_terms(local_i: u32, word: u32, lane: u32) -> vec4<u32> {
             count_row(shuffled[grouped_row(base, place) * sizes.row_words + word], lane);
             place += 1u;
         }
-        total += flush(lane);
+        tally = flush(tally, symbol, i, word, lane);
     }
-    return total;
+    return tally;
 }
 
 // Which pairs a workgroup computes. z runs over column groups within a block of j, so that neighbours share a block.
@@ -121,11 +108,6 @@ fn work_of(group: vec3<u32>) -> Work {
     // Blocks left of the diagonal hold no pair.
     let last_j = block * BLOCK_COLUMNS + BLOCK_COLUMNS - 1u;
     return Work(local_i, block, local_i < chunk.columns && last_j > chunk.first_i + local_i);
-}
-
-// X of column i with column j.
-fn score(joint: u32, i: u32, j: u32) -> i32 {
-    return bitcast<i32>(joint - column_terms[i] - column_terms[j] + table[sizes.n]);
 }
 
 // Place of the pair in the chunk.
@@ -154,12 +136,12 @@ fn count_reduce(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocati
     }
     let i = chunk.first_i + work.local_i;
     let word = work.block * LANES + lane;
-    let joint = joint_terms(work.local_i, min(word, sizes.row_words - 1u), lane);
+    let tally = tally_of(work.local_i, min(word, sizes.row_words - 1u), lane);
     var largest = 0u;
     for (var column = 0u; column < 4u; column += 1u) {
         let j = word * 4u + column;
         if j > i && j < sizes.l {
-            let x = score(joint[column], i, j);
+            let x = score(tally, column, i, j);
             accumulate(place_of(i, j), x);
             largest = max(largest, bitcast<u32>(x) ^ 0x80000000u);
         }
@@ -179,11 +161,11 @@ fn count_matrix(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocati
     }
     let i = chunk.first_i + work.local_i;
     let word = work.block * LANES + lane;
-    let joint = joint_terms(work.local_i, min(word, sizes.row_words - 1u), lane);
+    let tally = tally_of(work.local_i, min(word, sizes.row_words - 1u), lane);
     for (var column = 0u; column < 4u; column += 1u) {
         let j = word * 4u + column;
         if j > i && j < sizes.l {
-            scores[place_of(i, j)] = score(joint[column], i, j);
+            scores[place_of(i, j)] = score(tally, column, i, j);
         }
     }
 }

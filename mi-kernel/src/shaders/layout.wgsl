@@ -19,6 +19,11 @@ struct Sizes {
     left_bits: u32,
     right_bits: u32,
     plane_words: u32,
+    // s: fractional bits of the table.
+    scale_bits: u32,
+    padding_0: u32,
+    padding_1: u32,
+    padding_2: u32,
 }
 
 // Columns i of one launch, and where their pairs begin.
@@ -52,7 +57,7 @@ struct Iteration {
 @group(0) @binding(2) var<storage, read> bounds: array<u32>;
 // T(c) for c = 0..=n.
 @group(0) @binding(3) var<storage, read> table: array<u32>;
-// sum_a T(c_a) of each column.
+// What each column adds to its pairs' scores (src/gaps.rs).
 @group(0) @binding(4) var<storage, read> column_terms: array<u32>;
 @group(0) @binding(5) var<storage, read_write> round_keys: array<u32>;
 // Row after row, a byte a column.

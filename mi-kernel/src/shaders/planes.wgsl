@@ -38,7 +38,7 @@ fn planes_reduce(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocat
     for (var turn = 0u; turn < 4u; turn += 1u) {
         let j = work.block * BLOCK_COLUMNS + turn * LANES + lane;
         if j > i && j < sizes.l {
-            let x = score(joint_planes(i, j), i, j);
+            let x = joint_score(joint_planes(i, j), i, j);
             accumulate(place_of(i, j), x);
             largest = max(largest, bitcast<u32>(x) ^ 0x80000000u);
         }
@@ -60,7 +60,7 @@ fn planes_matrix(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocat
     for (var turn = 0u; turn < 4u; turn += 1u) {
         let j = work.block * BLOCK_COLUMNS + turn * LANES + lane;
         if j > i && j < sizes.l {
-            scores[place_of(i, j)] = score(joint_planes(i, j), i, j);
+            scores[place_of(i, j)] = joint_score(joint_planes(i, j), i, j);
         }
     }
 }

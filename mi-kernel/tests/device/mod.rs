@@ -61,14 +61,13 @@ impl Device {
     fn run(&self, job: &MiJob, reference: &Reference<'_>, shape: &Shape) -> Vec<Bytes> {
         let packed = PackedAlignment::new(reference, shape);
         let mut contents = Contents::new();
-        let q = u32::try_from(reference.alignment().q()).expect("a small alphabet");
         let named = AlignmentContents {
             codes: register(&mut contents, &packed.codes),
             orders: packed.orders.iter().map(|order| register(&mut contents, order)).collect(),
             bounds: register(&mut contents, &packed.bounds),
             table: register(&mut contents, &packed.table),
             column_terms: register(&mut contents, &packed.column_terms),
-            module: register(&mut contents, module_source(q).as_bytes()),
+            module: register(&mut contents, module_source(shape).as_bytes()),
         };
         let observed: Vec<Content> = shape
             .observed_bytes(reference.observed())
