@@ -2,6 +2,7 @@
 
 mod fairness;
 mod jobs;
+mod mi;
 mod scaling;
 mod scheduler;
 mod statistics;
@@ -106,6 +107,16 @@ async fn measure(arguments: &BenchArgs) -> anyhow::Result<Vec<Figure>> {
         BenchName::Steal => steal::measure(arguments.seed, runs(5), arguments.pictures.as_deref()).await,
         BenchName::Fairness => fairness::measure(arguments.seed, runs(1)).await,
         BenchName::Scaling => scaling::measure(runs(3)).await,
+        BenchName::Mi => {
+            let setup = mi::Setup {
+                set: arguments.set,
+                devices: &arguments.devices,
+                iterations: arguments.iterations,
+                seed: arguments.seed,
+                runs: runs(1),
+            };
+            mi::measure(&setup).await
+        }
     }
 }
 
