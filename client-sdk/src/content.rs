@@ -3,7 +3,10 @@
 
 use std::{
     collections::{BTreeSet, HashMap},
-    sync::{Arc, PoisonError, RwLock},
+    sync::{
+        Arc, PoisonError, RwLock,
+        atomic::{AtomicU64, Ordering},
+    },
 };
 
 use bytes::Bytes;
@@ -18,6 +21,8 @@ use proto::codec::content_hash;
 #[derive(Clone, Debug, Default)]
 pub(crate) struct ContentStore {
     contents: Arc<RwLock<HashMap<ContentHash, Stored>>>,
+    /// Bytes that nodes fetched.
+    served_bytes: Arc<AtomicU64>,
 }
 
 #[derive(Debug)]
@@ -34,6 +39,18 @@ impl ContentStore {
             .unwrap_or_else(PoisonError::into_inner)
             .get(hash)
             .map(|stored| stored.bytes.clone())
+    }
+
+    /// The same, for a node that fetches it.
+    pub(crate) fn serve(&self, hash: &ContentHash) -> Option<Bytes> {
+        let bytes = self.get(hash)?;
+        self.served_bytes.fetch_add(bytes.len() as u64, Ordering::Relaxed);
+        Some(bytes)
+    }
+
+    /// Bytes of contents that nodes fetched so far, those of fetches that broke off too.
+    pub(crate) fn served_bytes(&self) -> u64 {
+        self.served_bytes.load(Ordering::Relaxed)
     }
 
     fn retain(&self, hash: ContentHash, bytes: Bytes) {

@@ -91,7 +91,7 @@ impl Farm {
             inputs,
             session,
             registered,
-            contents: ContentSource::new(move |hash| contents.get(&hash)),
+            contents: ContentSource::new(move |hash| contents.serve(&hash)),
             progress: progress.clone(),
             stop: stop_receiver,
             closing: closing_receiver,

@@ -44,6 +44,9 @@ pub struct RunSummary {
     pub replanned: u64,
     /// Measured device time of the jobs.
     pub device_time: Duration,
+    /// Bytes of task allocations and modules that nodes fetched from this application while the run went (for all its
+    /// runs); what they took from each other does not count.
+    pub uploaded_bytes: u64,
     /// Time from the call of `run` to its return.
     pub wall_time: Duration,
     /// By task, in the order they were added to the graph.

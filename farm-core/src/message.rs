@@ -14,7 +14,7 @@ use crate::{
 };
 
 /// The protocol this build speaks. A peer of another version is refused at hello.
-pub const PROTOCOL_VERSION: u32 = 2;
+pub const PROTOCOL_VERSION: u32 = 3;
 
 /// Estimated work of a job: nanoseconds on a device of speed 1.0. Zero means unknown.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
@@ -365,6 +365,17 @@ pub enum NodeToCoordinator {
         /// Ended here, or another attempt is here: the reports say what became of them.
         unknown: Vec<JobAttempt>,
     },
+    /// This content is needed here and large: where should it come from? Answered with [`CoordinatorToNode::Located`], at
+    /// once or when another node has it. Asked again when it could not be had from there.
+    Locate(Content),
+    /// What large contents the cache holds now, or does no more; after a welcome all that it holds. A content that was
+    /// asked for and is not needed any more is gone, too.
+    CacheChanged {
+        /// Can be fetched here.
+        held: Vec<ContentHash>,
+        /// Cannot.
+        gone: Vec<ContentHash>,
+    },
     /// A drained node leaves: it holds no job any more.
     Goodbye,
 }
@@ -409,6 +420,13 @@ pub enum CoordinatorToNode {
         steal: StealId,
         /// Which.
         jobs: Vec<JobAttempt>,
+    },
+    /// Where to fetch a content.
+    Located {
+        /// Which.
+        content: ContentHash,
+        /// A node that has it; `None`: from the application.
+        peer: Option<Contact>,
     },
     /// Take no new work, finish what runs, say goodbye.
     Drain,

@@ -52,7 +52,7 @@ fn attempt(app: u8, index: u8, sequence: u8) -> JobAttempt {
 }
 
 fn content(tag: u8) -> Content {
-    Content { hash: ContentHash([tag; 32]), size_bytes: 4 }
+    Content { hash: ContentHash([tag; 32]), size_bytes: if tag % 2 == 0 { 4 } else { 4 << 20 } }
 }
 
 fn device(speed: u8) -> DeviceInfo {
@@ -163,6 +163,11 @@ fn coordinator_event(step: Step) -> coordinator::Event {
             running: Vec::new(),
             unknown: Vec::new(),
         }),
+        18 => from_node(NodeToCoordinator::Locate(content(step.three))),
+        19 => from_node(NodeToCoordinator::CacheChanged {
+            held: (0..step.three).map(|tag| content(tag).hash).collect(),
+            gone: (0..step.four).map(|tag| content(tag).hash).collect(),
+        }),
         13 if step.four == 0 => from_node(NodeToCoordinator::Goodbye),
         15 => coordinator::Event::DrainRequested { node: NodeId(step.two.into()) },
         _ => coordinator::Event::LinkClosed { link },
@@ -252,6 +257,11 @@ fn worker_event(step: Step) -> worker::Event {
         25 if step.three == 0 && step.four == 0 => worker::Event::DrainRequested,
         27 => worker::Event::Yielded { job: job(step), device },
         28 => worker::Event::Resumed { job: job(step), device },
+        29 => worker::Event::ContentEvicted(ContentHash([step.two; 32])),
+        30 => worker::Event::FromCoordinator(CoordinatorToNode::Located {
+            content: ContentHash([step.two; 32]),
+            peer: step.three.is_multiple_of(2).then(contact),
+        }),
         _ => worker::Event::CoordinatorConnected,
     }
 }
@@ -417,7 +427,7 @@ proptest! {
     #![proptest_config(ProptestConfig { cases: 2_000, failure_persistence: None, ..ProptestConfig::default() })]
 
     #[test]
-    fn the_coordinator_keeps_its_invariants(steps in steps(18)) {
+    fn the_coordinator_keeps_its_invariants(steps in steps(20)) {
         let mut machine = CoordinatorMachine::new(CoordinatorConfig::new(Epoch(1), 1));
         let mut now = Instant::ZERO;
         for step in steps {
@@ -435,7 +445,7 @@ proptest! {
     }
 
     #[test]
-    fn the_worker_keeps_its_invariants(steps in steps(29)) {
+    fn the_worker_keeps_its_invariants(steps in steps(31)) {
         let mut machine = worker_machine();
         let mut handed = Vec::new();
         let mut now = Instant::ZERO;

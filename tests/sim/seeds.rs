@@ -18,12 +18,14 @@ fn sweep(name: &str, seeds: std::ops::Range<u64>) -> Checks {
 
 /// A sweep in which nothing was there to be judged proves nothing.
 fn judge(name: &str, seeds: std::ops::Range<u64>) {
-    let Checks { books, whereabouts, plans, executions, lags, steals, speculations, .. } = sweep(name, seeds);
+    let Checks { books, whereabouts, plans, executions, lags, steals, speculations, peer_fetches, .. } =
+        sweep(name, seeds);
     assert!(books > 0 && plans > 0 && executions > 0, "nothing happened");
     assert!(whereabouts > 0, "I1: no quiet moment with open jobs");
     assert!(lags > 0, "I7: no moment with two backlogged applications");
     assert!(steals > 0, "I9: no steal");
     assert!(speculations > 0, "I5: no second attempt");
+    assert!(peer_fetches > 0, "no node took a content from another one");
 }
 
 macro_rules! sweeps {

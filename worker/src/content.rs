@@ -1,14 +1,43 @@
-//! Task allocations and modules in memory: least recently used out, pinned ones stay. Fetches nothing itself.
+//! Task allocations and modules in memory: least recently used out, pinned ones stay. Fetches nothing itself; other nodes
+//! fetch from its [`Shelf`].
 
-use std::collections::{BTreeMap, HashMap};
+use std::{
+    collections::{BTreeMap, HashMap},
+    sync::{Arc, PoisonError, RwLock},
+};
 
 use bytes::Bytes;
 use farm_core::id::ContentHash;
+
+/// The bytes of the contents in memory, for whoever answers fetches.
+///
+/// A lock, not messages to the cache's owner: fetches are answered on any number of streams, and must not wait for the
+/// machine's turn. It is held for a map operation only, bytes are reference-counted.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Shelf {
+    bytes: Arc<RwLock<HashMap<ContentHash, Bytes>>>,
+}
+
+impl Shelf {
+    /// The bytes of a content that is here.
+    pub(crate) fn get(&self, hash: &ContentHash) -> Option<Bytes> {
+        self.bytes.read().unwrap_or_else(PoisonError::into_inner).get(hash).cloned()
+    }
+
+    fn put(&self, hash: ContentHash, bytes: Bytes) {
+        self.bytes.write().unwrap_or_else(PoisonError::into_inner).insert(hash, bytes);
+    }
+
+    fn take(&self, hash: &ContentHash) {
+        self.bytes.write().unwrap_or_else(PoisonError::into_inner).remove(hash);
+    }
+}
 
 /// The node's contents in memory.
 #[derive(Debug)]
 pub(crate) struct ContentCache {
     entries: HashMap<ContentHash, Entry>,
+    shelf: Shelf,
     /// Unpinned entries by last use.
     idle: BTreeMap<u64, ContentHash>,
     bytes: u64,
@@ -18,7 +47,7 @@ pub(crate) struct ContentCache {
 
 #[derive(Debug)]
 struct Entry {
-    bytes: Bytes,
+    size_bytes: u64,
     /// When it was used last; meaningless while pinned.
     last_use: u64,
     pinned: bool,
@@ -33,7 +62,14 @@ pub(crate) struct CacheFull {
 
 impl ContentCache {
     pub(crate) fn new(cap_bytes: u64) -> Self {
-        Self { entries: HashMap::new(), idle: BTreeMap::new(), bytes: 0, cap_bytes, uses: 0 }
+        Self {
+            entries: HashMap::new(),
+            shelf: Shelf::default(),
+            idle: BTreeMap::new(),
+            bytes: 0,
+            cap_bytes,
+            uses: 0,
+        }
     }
 
     /// Keeps a content until it is released; false if it is not here.
@@ -55,8 +91,18 @@ impl ContentCache {
         }
     }
 
-    /// Takes a content in, pinned; evicts idle ones for it.
-    pub(crate) fn insert(&mut self, hash: ContentHash, bytes: Bytes) -> Result<(), CacheFull> {
+    /// Where others read.
+    pub(crate) const fn shelf(&self) -> &Shelf {
+        &self.shelf
+    }
+
+    /// Takes a content in, pinned; evicts idle ones for it, which `evicted` is told of.
+    pub(crate) fn insert(
+        &mut self,
+        hash: ContentHash,
+        bytes: Bytes,
+        mut evicted: impl FnMut(ContentHash),
+    ) -> Result<(), CacheFull> {
         if self.pin(hash) {
             return Ok(());
         }
@@ -65,18 +111,21 @@ impl ContentCache {
             let Some((_, oldest)) = self.idle.pop_first() else {
                 return Err(CacheFull { pinned_bytes: self.bytes, cap_bytes: self.cap_bytes });
             };
-            if let Some(evicted) = self.entries.remove(&oldest) {
-                self.bytes -= evicted.bytes.len() as u64;
+            if let Some(entry) = self.entries.remove(&oldest) {
+                self.bytes -= entry.size_bytes;
+                self.shelf.take(&oldest);
+                evicted(oldest);
             }
         }
         self.bytes += size_bytes;
-        self.entries.insert(hash, Entry { bytes, last_use: 0, pinned: true });
+        self.shelf.put(hash, bytes);
+        self.entries.insert(hash, Entry { size_bytes, last_use: 0, pinned: true });
         Ok(())
     }
 
     /// The bytes of a content that is here.
     pub(crate) fn get(&self, hash: &ContentHash) -> Option<Bytes> {
-        self.entries.get(hash).map(|entry| entry.bytes.clone())
+        self.shelf.get(hash)
     }
 }
 
@@ -92,13 +141,15 @@ mod tests {
     fn the_least_recently_used_idle_content_goes_first() {
         let mut cache = ContentCache::new(100);
         let [(a, a_bytes), (b, b_bytes), (c, c_bytes)] = [content(1, 40), content(2, 40), content(3, 40)];
-        cache.insert(a, a_bytes).unwrap();
-        cache.insert(b, b_bytes).unwrap();
+        let mut evicted = Vec::new();
+        cache.insert(a, a_bytes, |hash| evicted.push(hash)).unwrap();
+        cache.insert(b, b_bytes, |hash| evicted.push(hash)).unwrap();
         cache.release(a);
         cache.release(b);
         assert!(cache.pin(a), "a is here");
         cache.release(a);
-        cache.insert(c, c_bytes).unwrap();
+        cache.insert(c, c_bytes, |hash| evicted.push(hash)).unwrap();
+        assert_eq!(evicted, [b], "whoever announces contents is told");
         assert!(cache.get(&b).is_none(), "b was used before a");
         assert!(cache.get(&a).is_some() && cache.get(&c).is_some(), "only one had to go");
     }
@@ -107,12 +158,15 @@ mod tests {
     fn pinned_contents_stay_and_the_cap_holds() {
         let mut cache = ContentCache::new(100);
         let [(a, a_bytes), (b, b_bytes)] = [content(1, 60), content(2, 60)];
-        cache.insert(a, a_bytes.clone()).unwrap();
-        cache.insert(a, a_bytes).unwrap();
+        cache.insert(a, a_bytes.clone(), drop).unwrap();
+        cache.insert(a, a_bytes, drop).unwrap();
         assert_eq!(cache.bytes, 60, "the same content is held once");
-        assert_eq!(cache.insert(b, b_bytes.clone()), Err(CacheFull { pinned_bytes: 60, cap_bytes: 100 }));
+        assert_eq!(
+            cache.insert(b, b_bytes.clone(), drop),
+            Err(CacheFull { pinned_bytes: 60, cap_bytes: 100 })
+        );
         cache.release(a);
-        cache.insert(b, b_bytes).unwrap();
+        cache.insert(b, b_bytes, drop).unwrap();
         assert!(cache.get(&a).is_none(), "the cap holds");
     }
 }

@@ -13,13 +13,13 @@ use farm_core::{
     message::{AppToNode, CoordinatorToNode, JobFailure, LatencyClass, NodeToApp, NodeToCoordinator},
     program::{Command, Content, JobProgram},
     time,
-    worker::{Effect, Event, WorkerConfig, WorkerMachine},
+    worker::{Effect, Event, Provider, WorkerConfig, WorkerMachine},
 };
 use gpu_exec::{Executor, Order};
 use proto::{
     codec,
     control::{SessionError, SessionSender},
-    link::{DataServer, FetchError, Frame, LinkSender},
+    link::{DataServer, Frame, LinkSender},
 };
 use tokio::{
     sync::{mpsc, oneshot},
@@ -60,7 +60,7 @@ pub(crate) enum Input {
     /// An application's link is over.
     LinkEnded { link: LinkId },
     /// A fetch is through.
-    Fetched { content: Content, result: Result<Bytes, FetchError> },
+    Fetched { content: Content, result: Result<Bytes, String> },
     /// The process was asked to end in order.
     Drain,
 }
@@ -124,7 +124,8 @@ pub(crate) async fn drive(setup: Setup) -> End {
         end: None,
         tasks: JoinSet::new(),
     };
-    driver.tasks.spawn(link::accept(Arc::clone(&server), inputs));
+    let shelf = driver.contents.shelf().clone();
+    driver.tasks.spawn(link::accept(Arc::clone(&server), shelf, inputs));
     driver.connected(session);
     let mut taken = Vec::with_capacity(INPUTS_PER_TURN);
     let mut heard = Vec::with_capacity(INPUTS_PER_TURN);
@@ -244,6 +245,7 @@ impl Driver {
             | CoordinatorToNode::AppLeft { .. }
             | CoordinatorToNode::Cancel { .. }
             | CoordinatorToNode::Retract { .. }
+            | CoordinatorToNode::Located { .. }
             | CoordinatorToNode::Drain
             | CoordinatorToNode::HeartbeatAck { .. } => {}
         }
@@ -347,7 +349,7 @@ impl Driver {
                     outbox.close("closed by the node");
                 }
             }
-            Effect::Fetch { content, link } => self.fetch(content, link),
+            Effect::Fetch { content, from } => self.fetch(content, from),
             Effect::Execute { job, device, class } => self.execute(job, device, class),
             Effect::Abort { job, device } => {
                 if let Some(device) = self.devices.get_mut(usize::from(device.0)) {
@@ -377,7 +379,7 @@ impl Driver {
         }
     }
 
-    fn fetch(&mut self, content: Content, link: LinkId) {
+    fn fetch(&mut self, content: Content, from: Provider) {
         if self.contents.pin(content.hash) {
             self.found.push(Event::ContentReady(content.hash));
             return;
@@ -385,32 +387,45 @@ impl Driver {
         if self.fetching.insert(content.hash, true).is_some() {
             return;
         }
-        let Some(outbox) = self.links.get(&link) else {
-            self.fetching.remove(&content.hash);
-            let reason = "its application's link is over".to_owned();
-            self.found.push(Event::ContentFailed { content: content.hash, reason });
-            return;
-        };
-        let (sender, inputs) = (outbox.sender().clone(), self.inputs.clone());
-        tokio::spawn(async move {
-            let result = sender.fetch(content).await;
-            // Without a driver the worker has ended.
-            let _ = inputs.send(Input::Fetched { content, result }).await;
-        });
+        let inputs = self.inputs.clone();
+        // Without a driver the worker has ended.
+        match from {
+            Provider::Application(link) => {
+                let Some(outbox) = self.links.get(&link) else {
+                    self.fetching.remove(&content.hash);
+                    let reason = "its application's link is over".to_owned();
+                    self.found.push(Event::ContentFailed { content: content.hash, reason });
+                    return;
+                };
+                let sender = outbox.sender().clone();
+                tokio::spawn(async move {
+                    let result = sender.fetch(content).await.map_err(|error| error.to_string());
+                    let _ = inputs.send(Input::Fetched { content, result }).await;
+                });
+            }
+            Provider::Node(contact) => {
+                tokio::spawn(async move {
+                    let result = link::fetch_from_peer(contact, content).await;
+                    let _ = inputs.send(Input::Fetched { content, result }).await;
+                });
+            }
+        }
     }
 
-    fn fetched(&mut self, content: Content, result: Result<Bytes, FetchError>) {
+    fn fetched(&mut self, content: Content, result: Result<Bytes, String>) {
         let wanted = self.fetching.remove(&content.hash).unwrap_or(false);
         let failed = |reason: String| Event::ContentFailed { content: content.hash, reason };
         let event = match result {
-            Ok(bytes) => match self.contents.insert(content.hash, bytes) {
+            Ok(bytes) => match self.contents.insert(content.hash, bytes, |hash| {
+                self.found.push(Event::ContentEvicted(hash));
+            }) {
                 Ok(()) => Event::ContentReady(content.hash),
                 Err(full) => failed(format!(
                     "the content cache of {} B is full of contents in use ({} B)",
                     full.cap_bytes, full.pinned_bytes
                 )),
             },
-            Err(error) => failed(error.to_string()),
+            Err(reason) => failed(reason),
         };
         if wanted {
             self.tell(event);

@@ -1,4 +1,5 @@
-//! Applications' links: accepting them, reading from them, and writing to them without ever waiting in the owner task.
+//! Links: accepting those of applications and of nodes that fetch, reading from them, writing to them without ever waiting in
+//! the owner task; fetching from other nodes.
 
 use std::{
     collections::VecDeque,
@@ -8,31 +9,41 @@ use std::{
 use bytes::Bytes;
 use farm_core::{
     id::LinkId,
-    message::{AppToNode, NodeToApp},
+    message::{AppToNode, Contact, NodeToApp},
+    program::Content,
 };
 use proto::link::{ContentSource, DataServer, Frame, Link, LinkReceiver, LinkSender, TrySendError};
 use tokio::sync::mpsc;
 
-use crate::driver::Input;
+use crate::{content::Shelf, driver::Input};
 
 /// Frames taken from a link at once.
 const FRAMES_PER_READ: usize = 64;
 
-/// Accepts applications until the server shuts down.
-pub(crate) async fn accept(server: Arc<DataServer>, inputs: mpsc::Sender<Input>) {
+/// Accepts applications and nodes until the server shuts down.
+pub(crate) async fn accept(server: Arc<DataServer>, shelf: Shelf, inputs: mpsc::Sender<Input>) {
     let mut next = 0;
     while let Some(incoming) = server.accept().await {
         let link = LinkId(next);
         next += 1;
-        let inputs = inputs.clone();
+        let (inputs, shelf) = (inputs.clone(), shelf.clone());
         tokio::spawn(async move {
-            // Applications fetch nothing from nodes yet; peers will.
-            match incoming.establish(ContentSource::empty()).await {
+            // Whoever knows a content's digest may have it.
+            match incoming.establish(ContentSource::new(move |hash| shelf.get(&hash))).await {
                 Ok(Link { sender, receiver }) => read(link, sender, receiver, inputs).await,
                 Err(error) => tracing::debug!(%link, %error, "a link was not made"),
             }
         });
     }
+}
+
+/// Fetches a content from another node's shelf, on a link of its own: its handshake is little beside a large content.
+pub(crate) async fn fetch_from_peer(contact: Contact, content: Content) -> Result<Bytes, String> {
+    let link: Link<AppToNode, NodeToApp> =
+        proto::link::connect(&contact.addresses, &contact.certificate_der, ContentSource::empty())
+            .await
+            .map_err(|error| error.to_string())?;
+    link.sender.fetch(content).await.map_err(|error| error.to_string())
 }
 
 async fn read(

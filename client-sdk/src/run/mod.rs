@@ -205,12 +205,14 @@ impl Run {
             dispatch_time: Duration::ZERO,
             away: 0,
         };
+        let uploaded_before = runner.store.served_bytes();
         runner.run()?;
         let tasks: Vec<TaskSummary> = runner.states.iter().map(TaskState::summary).collect();
         Ok(RunSummary {
             jobs: tasks.iter().map(|task| task.jobs).sum(),
             replanned: runner.progress.borrow().replanned.saturating_sub(replanned_before),
             device_time: tasks.iter().map(|task| task.device_time).sum(),
+            uploaded_bytes: runner.store.served_bytes() - uploaded_before,
             wall_time: started.elapsed(),
             tasks,
         })

@@ -23,6 +23,7 @@ impl CoordinatorMachine {
         self.check_queue();
         self.check_steals();
         self.check_backups();
+        self.check_spreads();
     }
 
     fn check_links(&self) {

@@ -57,6 +57,7 @@ impl CoordinatorMachine {
         self.expire_apps(now);
         self.expire_steals(now);
         self.expire_questions(now);
+        self.open_lanes(now);
     }
 
     /// Finds the next deadline.
@@ -76,7 +77,8 @@ impl CoordinatorMachine {
         });
         let steals = self.steals.values().map(|steal| Some(steal.answer_by));
         let questions = self.questions.values().map(|asked| Some(asked.answer_by));
-        self.wake = nodes.chain(apps).chain(steals).chain(questions).flatten().min();
+        self.wake =
+            nodes.chain(apps).chain(steals).chain(questions).chain([self.lanes_due()]).flatten().min();
     }
 
     fn expire_nodes(&mut self, now: Instant) {

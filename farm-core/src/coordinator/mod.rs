@@ -4,10 +4,11 @@
 //! ([`LinkId`]) and carries the effects out.
 //!
 //! Split by event family: `registry` (who is there), `placement` (where jobs go, by a `policy`; `consult` asks plug-ins),
-//! `report` (what ended), `replan` (what was lost), `steal` (what moves between nodes), `speculate` (what runs twice at the tail), `lease` (who is silent), `status`
+//! `report` (what ended), `replan` (what was lost), `steal` (what moves between nodes), `speculate` (what runs twice at the tail), `lease` (who is silent), `contents` (who has and brings which data), `status`
 //! (what operators see), `timeline` (what ran when and where). `model` holds the state they share, `rates` what devices are worth.
 
 mod consult;
+mod contents;
 mod invariants;
 mod lease;
 mod model;
@@ -28,6 +29,7 @@ use serde::{Deserialize, Serialize};
 
 use self::{
     consult::{Asked, PluginFaults},
+    contents::Spreads,
     model::{App, Node, Peer, Pending, Placement},
     policy::{Choice, History, Question, QuestionId},
     rates::Modules,
@@ -273,6 +275,8 @@ pub struct CoordinatorMachine {
     plugin_faults: BTreeMap<String, PluginFaults>,
     /// Jobs that lost their place during the current event.
     lost: BTreeMap<(AppId, BatchId), Vec<JobKey>>,
+    /// Who has large contents, and who brings them where.
+    spreads: Spreads,
     /// Retract orders without an answer; at most one for each thief.
     steals: BTreeMap<StealId, Steal>,
     next_steal: u64,
@@ -313,6 +317,7 @@ impl CoordinatorMachine {
             next_question: 1,
             plugin_faults: BTreeMap::new(),
             lost: BTreeMap::new(),
+            spreads: Spreads::default(),
             steals: BTreeMap::new(),
             next_steal: 1,
             steal_latency: StealLatency::default(),
@@ -427,6 +432,8 @@ impl CoordinatorMachine {
                 tracing::debug!(%steal, %node, kept = running.len(), unknown = unknown.len(), "retracted");
                 self.retracted(now, node, steal, &retracted);
             }
+            NodeToCoordinator::Locate(content) => self.locate(now, node, content),
+            NodeToCoordinator::CacheChanged { held, gone } => self.cache_changed(now, node, &held, &gone),
             NodeToCoordinator::Goodbye => {
                 self.close(link);
                 self.node_leaves(now, node);

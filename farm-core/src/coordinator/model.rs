@@ -207,6 +207,19 @@ impl Node {
         }
     }
 
+    /// It dropped one.
+    pub(super) fn holds_no_more(&mut self, content: ContentHash) {
+        self.contents.remove(&content);
+    }
+
+    /// Whether it answers, as far as is known.
+    pub(super) fn is_up(&self) -> bool {
+        match self.state {
+            NodeState::Alive | NodeState::Draining => self.link.is_some(),
+            NodeState::Suspect => false,
+        }
+    }
+
     /// Whether new work may be planned here.
     pub(super) fn takes_work(&self) -> bool {
         match self.state {

@@ -90,6 +90,7 @@ impl CoordinatorMachine {
         if draining {
             self.tell_node(id, CoordinatorToNode::Drain);
         }
+        self.forget_cache_of(now, id);
         self.reconcile(now, id, &hello.inventory);
         self.retry_stuck();
         tracing::info!(node = %id, name = hello.name, session = %hello.session, "node registered");

@@ -48,6 +48,7 @@ impl CoordinatorMachine {
         if let Some(link) = node.link {
             self.close(link);
         }
+        self.forget_cache_of(now, id);
         for app in self.apps.values_mut() {
             app.unreachable.remove(&id);
         }

@@ -1,11 +1,15 @@
-//! Contents that held jobs name: which are here, which are on their way, who waits for them. Bytes are the driver's.
+//! Contents that held jobs name: which are here, which are on their way and from where, who waits for them. Bytes are the
+//! driver's.
+//!
+//! Small contents come from the application at once. Of large ones the coordinator is asked where they should come from: a
+//! node that has them, or the application.
 
 use std::{collections::BTreeSet, time::Duration};
 
-use super::{Effect, WorkerMachine, job::HeldState};
+use super::{Effect, Provider, WorkerMachine, job::HeldState};
 use crate::{
     id::{ContentHash, JobAttempt, LinkId},
-    message::JobFailure,
+    message::{Contact, JobFailure, NodeToCoordinator},
     program::Content,
     time::Instant,
 };
@@ -16,6 +20,15 @@ const MAX_FETCH_TRIES: u32 = 3;
 /// Pause before a failed fetch is tried again, in milliseconds: long enough to learn that the link closed, which is the
 /// usual reason and no reason to give up.
 const REFETCH_MS: u64 = 100;
+
+/// Contents told of in one message.
+const MAX_TOLD: usize = 1_024;
+
+/// Contents from this size on are asked for at the coordinator, in bytes: what its answer takes is lost in their transfer.
+const LARGE_BYTES: u64 = 1 << 20;
+
+/// Longest wait for the coordinator's answer, in milliseconds; then the application is asked.
+const LOCATED_MS: u64 = 60_000;
 
 /// A content that some held, unexecuted job names.
 #[derive(Debug)]
@@ -34,27 +47,45 @@ pub(super) struct Holding {
 pub(super) enum ContentState {
     /// In the node's cache.
     Ready,
-    /// Asked for on this link.
+    /// Asked for on this application's link.
     Fetching(LinkId),
+    /// Asked for at another node.
+    FetchingFromPeer,
+    /// The coordinator was asked where to fetch it; until then an answer is awaited.
+    Locating {
+        /// Then the application is asked.
+        until: Instant,
+    },
     /// To be asked for: no link yet, or the last try failed.
     Wanted,
 }
 
 impl WorkerMachine {
     /// Counts a new job's contents. Returns how many are not here.
-    pub(super) fn hold_contents(&mut self, link: LinkId, job: JobAttempt, contents: &[Content]) -> usize {
+    pub(super) fn hold_contents(
+        &mut self,
+        now: Instant,
+        link: LinkId,
+        job: JobAttempt,
+        contents: &[Content],
+    ) -> usize {
         let mut missing = 0;
         for &content in contents {
-            let holding = self.contents.entry(content.hash).or_insert_with(|| {
-                self.effects.push_back(Effect::Fetch { content, link });
-                let state = ContentState::Fetching(link);
-                Holding { content, state, references: 0, waiting: BTreeSet::new(), failed_tries: 0 }
-            });
+            if !self.contents.contains_key(&content.hash) {
+                let state = ContentState::Wanted;
+                let holding =
+                    Holding { content, state, references: 0, waiting: BTreeSet::new(), failed_tries: 0 };
+                self.contents.insert(content.hash, holding);
+                if self.may_be_located(&content) {
+                    self.ask_where(now, content);
+                }
+            }
+            let Some(holding) = self.contents.get_mut(&content.hash) else { continue };
             holding.references += 1;
             // Nobody with a link waited for it; this job's application has one.
             if holding.state == ContentState::Wanted {
                 holding.state = ContentState::Fetching(link);
-                self.effects.push_back(Effect::Fetch { content, link });
+                self.effects.push_back(Effect::Fetch { content, from: Provider::Application(link) });
             }
             if holding.state != ContentState::Ready {
                 holding.waiting.insert(job);
@@ -70,8 +101,13 @@ impl WorkerMachine {
             holding.references -= 1;
             holding.waiting.remove(&job);
             if holding.references == 0 {
+                let state = holding.state;
                 self.contents.remove(&content.hash);
                 self.push(Effect::Release(content.hash));
+                // The coordinator need not wait for it to arrive here.
+                if state != ContentState::Ready && content.size_bytes >= LARGE_BYTES {
+                    self.tell_cache_changed(Vec::new(), vec![content.hash]);
+                }
             }
         }
     }
@@ -80,6 +116,7 @@ impl WorkerMachine {
         let Some(holding) = self.contents.get_mut(&hash) else { return };
         holding.state = ContentState::Ready;
         holding.failed_tries = 0;
+        let is_large = holding.content.size_bytes >= LARGE_BYTES;
         for job in std::mem::take(&mut holding.waiting) {
             let Some(held) = self.jobs.get_mut(&job.job).filter(|held| held.attempt == job.attempt) else {
                 continue;
@@ -90,14 +127,97 @@ impl WorkerMachine {
                 self.enqueue(job.job);
             }
         }
+        if is_large && self.cached.insert(hash) {
+            self.tell_cache_changed(vec![hash], Vec::new());
+        }
+    }
+
+    pub(super) fn content_evicted(&mut self, hash: ContentHash) {
+        if self.cached.remove(&hash) {
+            self.tell_cache_changed(Vec::new(), vec![hash]);
+        }
+    }
+
+    /// The coordinator's word on where to fetch a content.
+    pub(super) fn located(&mut self, hash: ContentHash, peer: Option<Contact>) {
+        let Some(holding) = self.contents.get_mut(&hash) else { return };
+        match holding.state {
+            ContentState::Locating { .. } => {}
+            // It is here, or was not waited for.
+            ContentState::Ready
+            | ContentState::Fetching(_)
+            | ContentState::FetchingFromPeer
+            | ContentState::Wanted => return,
+        }
+        match peer {
+            Some(contact) => {
+                holding.state = ContentState::FetchingFromPeer;
+                let content = holding.content;
+                self.push(Effect::Fetch { content, from: Provider::Node(contact) });
+            }
+            None => {
+                holding.state = ContentState::Wanted;
+                self.fetch_wanted();
+            }
+        }
+    }
+
+    /// Without a coordinator nobody says where contents are but their applications.
+    pub(super) fn locate_nothing(&mut self) {
+        self.located_by = None;
+        for holding in self.contents.values_mut() {
+            if let ContentState::Locating { .. } = holding.state {
+                holding.state = ContentState::Wanted;
+            }
+        }
+        self.fetch_wanted();
+    }
+
+    /// Registered (again): the coordinator need not know what is here.
+    pub(super) fn tell_cache(&mut self) {
+        let held: Vec<ContentHash> = self.cached.iter().copied().collect();
+        for held in held.chunks(MAX_TOLD) {
+            self.tell_cache_changed(held.to_vec(), Vec::new());
+        }
+    }
+
+    fn may_be_located(&self, content: &Content) -> bool {
+        content.size_bytes >= LARGE_BYTES
+            && self.session.is_registered()
+            && !self.cached.contains(&content.hash)
+    }
+
+    fn ask_where(&mut self, now: Instant, content: Content) {
+        let until = now.after(Duration::from_millis(LOCATED_MS));
+        let Some(holding) = self.contents.get_mut(&content.hash) else { return };
+        holding.state = ContentState::Locating { until };
+        self.located_by.get_or_insert(until);
+        self.tell_coordinator(NodeToCoordinator::Locate(content));
+    }
+
+    fn tell_cache_changed(&mut self, held: Vec<ContentHash>, gone: Vec<ContentHash>) {
+        if self.session.is_registered() {
+            self.tell_coordinator(NodeToCoordinator::CacheChanged { held, gone });
+        }
     }
 
     pub(super) fn content_failed(&mut self, now: Instant, hash: ContentHash, reason: &str) {
         let Some(holding) = self.contents.get_mut(&hash) else { return };
+        let content = holding.content;
         match holding.state {
             ContentState::Fetching(_) => {}
+            ContentState::FetchingFromPeer => {
+                tracing::info!(content = %hash, reason, "a peer could not be fetched from");
+                holding.state = ContentState::Wanted;
+                if self.may_be_located(&content) {
+                    self.ask_where(now, content);
+                } else {
+                    self.fetch_wanted();
+                }
+                return;
+            }
             // It came in another way, or the link's end was told first.
-            ContentState::Ready | ContentState::Wanted => return,
+            ContentState::Ready | ContentState::Wanted | ContentState::Locating { .. } => return,
         }
         tracing::warn!(content = %hash, reason, "fetch failed");
         holding.state = ContentState::Wanted;
@@ -143,13 +263,26 @@ impl WorkerMachine {
                 .find_map(|job| self.apps.get(&job.job.app).and_then(|app| app.link));
             if let Some(link) = link {
                 holding.state = ContentState::Fetching(link);
-                self.effects.push_back(Effect::Fetch { content: holding.content, link });
+                let from = Provider::Application(link);
+                self.effects.push_back(Effect::Fetch { content: holding.content, from });
             }
         }
     }
 
     pub(super) fn content_timeout(&mut self, now: Instant) {
-        if self.refetch_at.take_if(|at| *at <= now).is_some() {
+        let mut late = self.refetch_at.take_if(|at| *at <= now).is_some();
+        if self.located_by.take_if(|at| *at <= now).is_some() {
+            late = true;
+            for holding in self.contents.values_mut() {
+                let ContentState::Locating { until } = holding.state else { continue };
+                if until <= now {
+                    holding.state = ContentState::Wanted;
+                } else {
+                    self.located_by = Some(self.located_by.map_or(until, |by| by.min(until)));
+                }
+            }
+        }
+        if late {
             self.fetch_wanted();
         }
     }

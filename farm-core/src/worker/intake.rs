@@ -44,7 +44,7 @@ impl WorkerMachine {
             self.refuse(now, device, &ticket, failure);
             return;
         }
-        self.hold(link, device, ticket);
+        self.hold(now, link, device, ticket);
     }
 
     /// Takes a job out, whatever it is doing, without a word to anybody but the driver.
@@ -156,11 +156,11 @@ impl WorkerMachine {
         self.became_active(id.app);
     }
 
-    fn hold(&mut self, link: LinkId, device: DeviceIndex, ticket: JobTicket) {
+    fn hold(&mut self, now: Instant, link: LinkId, device: DeviceIndex, ticket: JobTicket) {
         let JobTicket { job, device: _, class, priority, cost, mut contents } = ticket;
         contents.sort_unstable();
         contents.dedup_by_key(|content| content.hash);
-        let missing = self.hold_contents(link, job, &contents);
+        let missing = self.hold_contents(now, link, job, &contents);
         let held = HeldJob {
             attempt: job.attempt,
             device,

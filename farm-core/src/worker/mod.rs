@@ -26,7 +26,7 @@ mod staging;
 mod standing;
 mod stride;
 
-use std::collections::{BTreeMap, VecDeque};
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
 use rand::{SeedableRng, rngs::SmallRng};
 
@@ -96,6 +96,8 @@ pub enum Event {
     },
     /// A content asked for by [`Effect::Fetch`] is in the node's cache (and stays while a queued job names it).
     ContentReady(ContentHash),
+    /// The cache made room: it does not have this content any more.
+    ContentEvicted(ContentHash),
     /// A content could not be had.
     ContentFailed {
         /// Which.
@@ -167,8 +169,8 @@ pub enum Effect {
     Fetch {
         /// Which.
         content: Content,
-        /// The connection of the application that has it.
-        link: LinkId,
+        /// Who has it.
+        from: Provider,
     },
     /// Hand a job to a device's executor, which holds at most one running and one staged job, and an interactive one
     /// in addition: that takes the device at the running one's next launch boundary.
@@ -196,6 +198,15 @@ pub enum Effect {
     Exit,
 }
 
+/// Who has a content.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Provider {
+    /// The application at the other end of this connection.
+    Application(LinkId),
+    /// Another node.
+    Node(Contact),
+}
+
 /// A worker node.
 #[derive(Debug)]
 pub struct WorkerMachine {
@@ -214,6 +225,10 @@ pub struct WorkerMachine {
     contents: BTreeMap<ContentHash, Holding>,
     /// When contents that failed to come are asked for again.
     refetch_at: Option<Instant>,
+    /// When the first of the contents whose whereabouts were asked for is fetched from its application without an answer.
+    located_by: Option<Instant>,
+    /// Large contents in the cache.
+    cached: BTreeSet<ContentHash>,
     devices: Vec<Device>,
     lags: Lags,
     share: Box<dyn FairShare>,
@@ -244,6 +259,8 @@ impl WorkerMachine {
             next_arrival: 0,
             contents: BTreeMap::new(),
             refetch_at: None,
+            located_by: None,
+            cached: BTreeSet::new(),
             devices,
             lags: Lags::default(),
             share,
@@ -266,6 +283,7 @@ impl WorkerMachine {
             Event::FromApp { link, message } => self.app_said(now, link, message),
             Event::AppLinkClosed { link } => self.app_link_closed(now, link),
             Event::ContentReady(content) => self.content_ready(content),
+            Event::ContentEvicted(content) => self.content_evicted(content),
             Event::ContentFailed { content, reason } => self.content_failed(now, content, &reason),
             Event::Started { job, device } | Event::Resumed { job, device } => self.started(now, job, device),
             Event::Yielded { job, device } => self.yielded(now, job, device),
@@ -298,7 +316,8 @@ impl WorkerMachine {
         let registered = self.session.next_heartbeat();
         let reports = registered.and_then(|_| self.reports.due());
         let apps = self.apps.values().filter_map(|app| app.drop_at).min();
-        [registered, reports, self.refetch_at, self.drain.deadline(), apps].into_iter().flatten().min()
+        let contents = [self.refetch_at, self.located_by];
+        [registered, reports, self.drain.deadline(), apps].into_iter().chain(contents).flatten().min()
     }
 
     /// The next thing to do; call until `None` after every `handle` and `handle_timeout`.

@@ -62,6 +62,7 @@ impl WorkerMachine {
         for app in self.apps.values_mut() {
             app.drop_at = None;
         }
+        self.locate_nothing();
     }
 
     pub(super) fn coordinator_said(&mut self, now: Instant, message: CoordinatorToNode) {
@@ -76,12 +77,14 @@ impl WorkerMachine {
                 self.reports.unsend();
                 self.await_announcements(now);
                 self.tell_lost_devices();
+                self.tell_cache();
             }
             CoordinatorToNode::Refused { reason } => self.refused(&reason),
             CoordinatorToNode::AppJoined { app, weight } => self.app_joined(app, weight),
             CoordinatorToNode::AppLeft { app } => self.app_left(app),
             CoordinatorToNode::Cancel { jobs } => jobs.into_iter().for_each(|job| self.cancel(job)),
             CoordinatorToNode::Retract { steal, jobs } => self.retract(steal, &jobs),
+            CoordinatorToNode::Located { content, peer } => self.located(content, peer),
             CoordinatorToNode::Drain => self.start_drain(now),
             CoordinatorToNode::HeartbeatAck { sequence } => self.reports.confirm(sequence),
         }

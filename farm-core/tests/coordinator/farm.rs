@@ -35,6 +35,8 @@ pub(crate) struct Farm {
     pub(crate) speculative: bool,
     /// By node, in order.
     pub(crate) cancelled: Vec<(u64, JobAttempt)>,
+    /// Nodes that were told where to fetch, and from which address; none is the application.
+    pub(crate) located: Vec<(u64, Option<String>)>,
 }
 
 impl Farm {
@@ -52,6 +54,7 @@ impl Farm {
             refused: None,
             speculative: false,
             cancelled: Vec::new(),
+            located: Vec::new(),
         };
         for (node, &score) in (1..).zip(scores) {
             farm.node_joins(node, score);
@@ -84,7 +87,7 @@ impl Farm {
             name: format!("node {node}"),
             session: NodeSession(node),
             devices: scores.iter().map(device).collect(),
-            contact: Contact { addresses: Vec::new(), certificate_der: Vec::new() },
+            contact: Contact { addresses: vec![format!("node {node}")], certificate_der: Vec::new() },
             inventory: Vec::new(),
         });
         self.handle(Event::FromNode { link: LinkId(node), message });
@@ -119,6 +122,9 @@ impl Farm {
                 }
                 Effect::ToNode { link, message: CoordinatorToNode::Cancel { jobs } } => {
                     self.cancelled.extend(jobs.into_iter().map(|job| (link.0, job)));
+                }
+                Effect::ToNode { link, message: CoordinatorToNode::Located { peer, .. } } => {
+                    self.located.push((link.0, peer.map(|peer| peer.addresses.concat())));
                 }
                 Effect::AskPolicy { id, plugin, question } => self.questions.push((id, plugin, question)),
                 Effect::ToApp { .. } | Effect::ToNode { .. } | Effect::Close { .. } => {}

@@ -7,3 +7,4 @@ mod guard;
 mod losses;
 mod policies;
 mod speculation;
+mod spread;

@@ -12,8 +12,9 @@ use farm_core::{
         AppToNode, Contact, CoordinatorToNode, CostNs, JobFailure, JobTicket, LatencyClass, Liveness,
         NodeToCoordinator, PROTOCOL_VERSION, Priority,
     },
+    program::Content,
     time::Instant,
-    worker::{Effect, Event, Share, WorkerConfig, WorkerMachine},
+    worker::{Effect, Event, Provider, Share, WorkerConfig, WorkerMachine},
 };
 
 pub(crate) const MILLISECOND_NS: u64 = 1_000_000;
@@ -25,6 +26,8 @@ pub(crate) struct Node {
     /// Orders to the executors, in order: what begins with `true` was handed over, else taken back.
     pub(crate) orders: Vec<(bool, u16, JobAttempt)>,
     pub(crate) said: Vec<NodeToCoordinator>,
+    /// What the driver was asked to bring, and from whom.
+    pub(crate) fetches: Vec<(Content, Provider)>,
 }
 
 impl Node {
@@ -46,8 +49,14 @@ impl Node {
             share: Share::DEFAULT,
             seed: 1,
         });
-        let mut node =
-            Self { machine, now: Instant::ZERO, next_job: 0, orders: Vec::new(), said: Vec::new() };
+        let mut node = Self {
+            machine,
+            now: Instant::ZERO,
+            next_job: 0,
+            orders: Vec::new(),
+            said: Vec::new(),
+            fetches: Vec::new(),
+        };
         node.tell(Event::CoordinatorConnected);
         let (id, epoch, liveness) = (NodeId(1), Epoch(1), Liveness::default());
         node.tell(Event::FromCoordinator(CoordinatorToNode::Welcome { node: id, epoch, liveness }));
@@ -70,10 +79,20 @@ impl Node {
                 Effect::Execute { job, device, .. } => self.orders.push((true, device.0, job)),
                 Effect::Abort { job, device } => self.orders.push((false, device.0, job)),
                 Effect::ToCoordinator(message) => self.said.push(message),
+                Effect::Fetch { content, from } => self.fetches.push((content, from)),
                 _ => {}
             }
         }
         self.machine.check_invariants();
+    }
+
+    /// One job of application 1 that needs contents.
+    pub(crate) fn job_with(&mut self, contents: Vec<Content>) -> JobAttempt {
+        let mut ticket = self.ticket(1, 0, LatencyClass::Batch, Priority(0));
+        ticket.contents = contents;
+        let job = ticket.job;
+        self.tell(Event::FromApp { link: LinkId(1), message: AppToNode::Jobs(vec![ticket]) });
+        job
     }
 
     /// Jobs of 10 ms arrive together, planned for one device.
@@ -89,24 +108,25 @@ impl Node {
         class: LatencyClass,
         priority: impl Fn(u32) -> Priority,
     ) -> Vec<JobAttempt> {
-        let tickets: Vec<JobTicket> = (0..count)
-            .map(|nth| {
-                self.next_job += 1;
-                let job = JobId { app: AppId(app), task: TaskId(0), index: JobIndex(self.next_job) };
-                let attempt = Attempt { epoch: Epoch(1), sequence: self.next_job.into() };
-                JobTicket {
-                    job: JobAttempt { job, attempt },
-                    device: DeviceIndex(device),
-                    class,
-                    priority: priority(nth),
-                    cost: CostNs(10 * MILLISECOND_NS),
-                    contents: Vec::new(),
-                }
-            })
-            .collect();
+        let tickets: Vec<JobTicket> =
+            (0..count).map(|nth| self.ticket(app, device, class, priority(nth))).collect();
         let jobs = tickets.iter().map(|ticket| ticket.job).collect();
         self.tell(Event::FromApp { link: LinkId(app), message: AppToNode::Jobs(tickets) });
         jobs
+    }
+
+    fn ticket(&mut self, app: u64, device: u16, class: LatencyClass, priority: Priority) -> JobTicket {
+        self.next_job += 1;
+        let job = JobId { app: AppId(app), task: TaskId(0), index: JobIndex(self.next_job) };
+        let attempt = Attempt { epoch: Epoch(1), sequence: self.next_job.into() };
+        JobTicket {
+            job: JobAttempt { job, attempt },
+            device: DeviceIndex(device),
+            class,
+            priority,
+            cost: CostNs(10 * MILLISECOND_NS),
+            contents: Vec::new(),
+        }
     }
 
     pub(crate) fn pass_ms(&mut self, ms: u64) {

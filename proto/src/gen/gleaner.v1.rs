@@ -1503,7 +1503,7 @@ pub mod apps_server {
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct NodeToCoordinator {
     /// One of these.
-    #[prost(oneof = "node_to_coordinator::Message", tags = "1, 2, 3, 4, 5, 6")]
+    #[prost(oneof = "node_to_coordinator::Message", tags = "1, 2, 3, 4, 5, 6, 7, 8")]
     pub message: ::core::option::Option<node_to_coordinator::Message>,
 }
 /// Nested message and enum types in `NodeToCoordinator`.
@@ -1529,6 +1529,12 @@ pub mod node_to_coordinator {
         /// Answer to a retract order.
         #[prost(message, tag = "6")]
         Retracted(super::Retracted),
+        /// A large content is needed: where should it come from?
+        #[prost(message, tag = "7")]
+        Locate(super::Content),
+        /// What the cache holds now, or does no more.
+        #[prost(message, tag = "8")]
+        CacheChanged(super::CacheChanged),
     }
 }
 /// A node's first message.
@@ -1646,6 +1652,16 @@ pub struct Retracted {
     #[prost(message, optional, tag = "4")]
     pub unknown: ::core::option::Option<Attempts>,
 }
+/// What large contents a node's cache holds now, or does no more.
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct CacheChanged {
+    /// blake3 of each that can be fetched there, 32 B.
+    #[prost(bytes = "vec", repeated, tag = "1")]
+    pub held: ::prost::alloc::vec::Vec<::prost::alloc::vec::Vec<u8>>,
+    /// blake3 of each that cannot, 32 B.
+    #[prost(bytes = "vec", repeated, tag = "2")]
+    pub gone: ::prost::alloc::vec::Vec<::prost::alloc::vec::Vec<u8>>,
+}
 /// A device is gone.
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct DeviceLost {
@@ -1660,7 +1676,7 @@ pub struct DeviceLost {
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct CoordinatorToNode {
     /// One of these.
-    #[prost(oneof = "coordinator_to_node::Message", tags = "1, 2, 3, 4, 5, 6, 7, 8")]
+    #[prost(oneof = "coordinator_to_node::Message", tags = "1, 2, 3, 4, 5, 6, 7, 8, 9")]
     pub message: ::core::option::Option<coordinator_to_node::Message>,
 }
 /// Nested message and enum types in `CoordinatorToNode`.
@@ -1692,6 +1708,9 @@ pub mod coordinator_to_node {
         /// Give these attempts up unless they run, and answer.
         #[prost(message, tag = "8")]
         Retract(super::Retract),
+        /// Where to fetch a content.
+        #[prost(message, tag = "9")]
+        Located(super::Located),
     }
 }
 /// Registered.
@@ -1726,6 +1745,16 @@ pub struct Retract {
     /// Which.
     #[prost(message, optional, tag = "2")]
     pub jobs: ::core::option::Option<Attempts>,
+}
+/// Where to fetch a content.
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct Located {
+    /// blake3 of it, 32 B.
+    #[prost(bytes = "vec", tag = "1")]
+    pub content: ::prost::alloc::vec::Vec<u8>,
+    /// A node that has it; unset: from the application.
+    #[prost(message, optional, tag = "2")]
+    pub peer: ::core::option::Option<Contact>,
 }
 /// Everything of an application can be freed.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]

@@ -53,6 +53,8 @@ pub struct Checks {
     pub books: u64,
     /// Batch jobs that made way for interactive ones.
     pub yields: u64,
+    /// Contents that a node took from another one.
+    pub peer_fetches: u64,
     /// Batches that a plug-in had answered for.
     pub plugin_answers: u64,
 }
@@ -71,6 +73,7 @@ impl Checks {
             whereabouts: self.whereabouts + other.whereabouts,
             books: self.books + other.books,
             yields: self.yields + other.yields,
+            peer_fetches: self.peer_fetches + other.peer_fetches,
             plugin_answers: self.plugin_answers + other.plugin_answers,
         }
     }

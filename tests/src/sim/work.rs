@@ -57,7 +57,11 @@ impl World {
 }
 
 fn jobs(count: u32, class: LatencyClass, known_cost: bool) -> Vec<SubmittedJob> {
-    let content = |tag| Content { hash: ContentHash([tag; 32]), size_bytes: 1_024 };
+    // The first two are large: nodes take them from each other.
+    let content = |tag: u8| Content {
+        hash: ContentHash([tag; 32]),
+        size_bytes: if tag <= 2 { 2 << 20 } else { 1_024 },
+    };
     (0..count)
         .map(|index| SubmittedJob {
             index: JobIndex(index),

@@ -152,7 +152,7 @@ impl From<v1::Liveness> for Liveness {
     }
 }
 
-fn content_hash(field: &'static str, bytes: &[u8]) -> Result<ContentHash, WireError> {
+pub(super) fn content_hash(field: &'static str, bytes: &[u8]) -> Result<ContentHash, WireError> {
     bytes.try_into().map(ContentHash).map_err(|_| invalid(field, format!("a digest of {} B", bytes.len())))
 }
 

@@ -1,7 +1,7 @@
 //! Worker nodes and the coordinator.
 
 use farm_core::{
-    id::{AppId, Epoch, JobAttempt, NodeId, NodeSession, StealId},
+    id::{AppId, ContentHash, Epoch, JobAttempt, NodeId, NodeSession, StealId},
     message::{
         CoordinatorToNode, DeviceLoad, Executed, JobFailure, JobTrace, NodeHello, NodeToCoordinator,
         RunningJob,
@@ -9,7 +9,10 @@ use farm_core::{
     time::Instant,
 };
 
-use super::{MAX_ENTRIES, WireError, cut, device, invalid, list, name, required, text, weight, within};
+use super::{
+    MAX_CONTENTS, MAX_ENTRIES, WireError, cut, device, invalid, list, model::content_hash, name, required,
+    text, weight, within,
+};
 use crate::control::v1;
 
 impl From<NodeToCoordinator> for v1::NodeToCoordinator {
@@ -34,6 +37,12 @@ impl From<NodeToCoordinator> for v1::NodeToCoordinator {
                     running: Some(running.as_slice().into()),
                     unknown: Some(unknown.as_slice().into()),
                 })
+            }
+            NodeToCoordinator::Locate(content) => Message::Locate(content.into()),
+            NodeToCoordinator::CacheChanged { held, gone } => {
+                let [held, gone] =
+                    [held, gone].map(|list| list.into_iter().map(|hash| hash.0.into()).collect());
+                Message::CacheChanged(v1::CacheChanged { held, gone })
             }
             NodeToCoordinator::Goodbye => Message::Goodbye(v1::Nothing {}),
         };
@@ -74,6 +83,11 @@ impl TryFrom<v1::NodeToCoordinator> for NodeToCoordinator {
                 retracted: required("Retracted.retracted", answer.retracted)?.try_into()?,
                 running: required("Retracted.running", answer.running)?.try_into()?,
                 unknown: required("Retracted.unknown", answer.unknown)?.try_into()?,
+            },
+            Message::Locate(content) => Self::Locate(content.try_into()?),
+            Message::CacheChanged(change) => Self::CacheChanged {
+                held: contents("CacheChanged.held", &change.held)?,
+                gone: contents("CacheChanged.gone", &change.gone)?,
             },
             Message::Goodbye(v1::Nothing {}) => Self::Goodbye,
         })
@@ -210,6 +224,11 @@ fn executed(wire: v1::Report) -> Result<Vec<Executed>, WireError> {
     }
 }
 
+fn contents(field: &'static str, wire: &[Vec<u8>]) -> Result<Vec<ContentHash>, WireError> {
+    within(field, wire.len(), MAX_CONTENTS)?;
+    wire.iter().map(|bytes| content_hash(field, bytes)).collect()
+}
+
 fn failure_of(wire: v1::ExecutedFailure) -> Result<JobFailure, WireError> {
     required("ExecutedFailure.failure", wire.failure)?.try_into()
 }
@@ -231,6 +250,9 @@ impl From<CoordinatorToNode> for v1::CoordinatorToNode {
             CoordinatorToNode::Cancel { jobs } => Message::Cancel(jobs.as_slice().into()),
             CoordinatorToNode::Retract { steal, jobs } => {
                 Message::Retract(v1::Retract { steal: steal.0, jobs: Some(jobs.as_slice().into()) })
+            }
+            CoordinatorToNode::Located { content, peer } => {
+                Message::Located(v1::Located { content: content.0.into(), peer: peer.map(Into::into) })
             }
             CoordinatorToNode::Drain => Message::Drain(v1::Nothing {}),
             CoordinatorToNode::HeartbeatAck { sequence } => {
@@ -261,6 +283,10 @@ impl TryFrom<v1::CoordinatorToNode> for CoordinatorToNode {
             Message::Retract(order) => Self::Retract {
                 steal: StealId(order.steal),
                 jobs: required("Retract.jobs", order.jobs)?.try_into()?,
+            },
+            Message::Located(located) => Self::Located {
+                content: content_hash("Located.content", &located.content)?,
+                peer: located.peer.map(TryInto::try_into).transpose()?,
             },
             Message::Drain(v1::Nothing {}) => Self::Drain,
             Message::HeartbeatAck(v1::HeartbeatAck { sequence }) => Self::HeartbeatAck { sequence },

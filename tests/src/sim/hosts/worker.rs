@@ -10,11 +10,12 @@ use farm_core::{
     id::{Attempt, ContentHash, DeviceIndex, JobAttempt, JobId, LinkId, NodeSession},
     message::{AppToNode, Contact, CoordinatorToNode, JobFailure, LatencyClass, NodeToApp},
     time::Instant,
-    worker::{Effect, Event, Share, WorkerConfig, WorkerMachine},
+    worker::{Effect, Event, Provider, Share, WorkerConfig, WorkerMachine},
 };
 use rand::Rng;
 
 use crate::sim::{
+    auditor::worker_at,
     clock::Clock,
     network::{Message, Proc},
     work::{cost_ns, digest},
@@ -291,15 +292,20 @@ impl World {
                 self.send(proc, link, Message::NodeToApp(message));
             }
             Effect::CloseApp { link } => self.hang_up(proc, link),
-            Effect::Fetch { content, link } => self.fetch(index, content.hash, link),
+            Effect::Fetch { content, from } => self.fetch(index, content.hash, &from),
             Effect::Execute { job, device, class } => self.execute(index, job, device, class),
             Effect::Abort { job, device } => self.abort(index, job, device),
             Effect::Discard(job) => {
                 self.workers[index].programs.remove(&job);
                 self.workers[index].payloads.remove(&job);
             }
+            // Now and then somebody else needs the room.
             Effect::Release(content) => {
-                self.workers[index].cache.remove(&content);
+                if self.rng.random_ratio(1, 2) && self.workers[index].cache.remove(&content) {
+                    let life = self.workers[index].life;
+                    let event = Event::ContentEvicted(content);
+                    self.after(Duration::ZERO, Happening::Worker { worker: index, life, event });
+                }
             }
             Effect::Exit => self.exit_worker(index),
         }
@@ -340,13 +346,23 @@ impl World {
         self.after(Duration::ZERO, Happening::Dial { proc: Proc::Worker(index), life });
     }
 
-    fn fetch(&mut self, index: usize, hash: ContentHash, link: LinkId) {
+    fn fetch(&mut self, index: usize, hash: ContentHash, from: &Provider) {
         let host = &mut self.workers[index];
         let life = host.life;
         let fails =
             self.work.fetch_fails_one_in > 0 && self.rng.random_ratio(1, self.work.fetch_fails_one_in);
         let cached = host.cache.contains(&hash);
-        let event = if cached || (self.is_open(link) && !fails) {
+        let has_it = match from {
+            Provider::Application(link) => self.is_open(*link),
+            Provider::Node(contact) => {
+                let peer = worker_at(&contact.addresses[0]);
+                let blocked = self.is_blocked(Proc::Worker(index), Proc::Worker(peer));
+                let served = !blocked && self.workers[peer].cache.contains(&hash);
+                self.audit.checks.peer_fetches += u64::from(served);
+                served
+            }
+        };
+        let event = if cached || (has_it && !fails) {
             self.workers[index].cache.insert(hash);
             Event::ContentReady(hash)
         } else {
