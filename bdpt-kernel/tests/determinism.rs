@@ -92,3 +92,27 @@ fn light_images_repeat_bit_for_bit_whatever_the_cuts() {
     assert!(bits(&once) == bits(&again), "fixed point does not see the order of splats");
     assert!(once.rgb.iter().any(|rgb| rgb[0] > 0.0), "there is light");
 }
+
+/// lavapipe compiled kernels anew for what jobs put into uniforms, and kept them all: a worker grew by 2.7 MB with each job.
+#[test]
+fn jobs_leave_no_memory_behind() {
+    const JOBS: u32 = 40;
+    let device = Device::open(Duration::from_millis(200));
+    let prepared = prepared(RenderOptions::default());
+    let tile = |at: u32| TileJob { x_px: at % 40, y_px: at % 30, width_px: 8, height_px: 8, ..WHOLE };
+    let run = |jobs: std::ops::Range<u32>| {
+        for at in jobs {
+            assert_eq!(device.tile(&prepared, tile(at)).pixels.len(), 64);
+        }
+        resident_bytes()
+    };
+    let before_bytes = run(0..10);
+    let grown_bytes = run(10..10 + JOBS).saturating_sub(before_bytes);
+    assert!(grown_bytes < 16 << 20, "{JOBS} jobs left {grown_bytes} B behind");
+}
+
+fn resident_bytes() -> u64 {
+    let sizes = std::fs::read_to_string("/proc/self/statm").expect("this is Linux");
+    let pages = sizes.split(' ').nth(1).and_then(|pages| pages.parse::<u64>().ok());
+    pages.expect("the second number is of resident pages") * 4_096
+}

@@ -136,6 +136,12 @@ impl Gpu {
         self.limits.max_storage_buffer_binding_size.min(self.limits.max_buffer_size) & !3
     }
 
+    /// Distance between named globals in a buffer, in bytes, whether they are bound as uniforms or as storage.
+    pub(crate) fn global_alignment(&self) -> u64 {
+        let limits = &self.limits;
+        limits.min_uniform_buffer_offset_alignment.max(limits.min_storage_buffer_offset_alignment).into()
+    }
+
     /// What the node announces.
     pub(crate) fn farm_limits(&self) -> Limits {
         Limits {

@@ -18,6 +18,9 @@ const UPLOAD_CHUNK_BYTES: usize = 32 << 20;
 /// Entries of the slice table are made for this many layers at least.
 const LEAST_SLICES: u32 = 1_024;
 
+/// Named globals are bound as uniforms or as storage (`module::GlobalsIn`).
+const GLOBALS: wgpu::BufferUsages = wgpu::BufferUsages::UNIFORM.union(wgpu::BufferUsages::STORAGE);
+
 /// What a pooled buffer is for; buffers of different purposes are never exchanged.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub(crate) enum Purpose {
@@ -35,9 +38,7 @@ impl Purpose {
             Self::Allocation => {
                 wgpu::BufferUsages::STORAGE | wgpu::BufferUsages::COPY_SRC | wgpu::BufferUsages::COPY_DST
             }
-            Self::Staging => {
-                wgpu::BufferUsages::UNIFORM | wgpu::BufferUsages::COPY_SRC | wgpu::BufferUsages::COPY_DST
-            }
+            Self::Staging => GLOBALS | wgpu::BufferUsages::COPY_SRC | wgpu::BufferUsages::COPY_DST,
             Self::Readback => wgpu::BufferUsages::MAP_READ | wgpu::BufferUsages::COPY_DST,
         }
     }
@@ -223,7 +224,7 @@ pub(crate) struct SliceTable {
 impl SliceTable {
     /// The table with at least `layers` entries, and the distance between entries in bytes.
     pub(crate) fn get(&mut self, gpu: &Gpu, layers: u32) -> (wgpu::Buffer, u64) {
-        let stride = u64::from(gpu.limits.min_uniform_buffer_offset_alignment);
+        let stride = gpu.global_alignment();
         if let Some((table, entries)) = &self.table
             && *entries >= layers
         {
@@ -240,7 +241,7 @@ impl SliceTable {
         let table = gpu.device.create_buffer(&wgpu::BufferDescriptor {
             label: Some("slice table"),
             size,
-            usage: wgpu::BufferUsages::UNIFORM | wgpu::BufferUsages::COPY_DST,
+            usage: GLOBALS | wgpu::BufferUsages::COPY_DST,
             mapped_at_creation: false,
         });
         gpu.queue.write_buffer(&table, 0, &bytes);

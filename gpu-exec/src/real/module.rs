@@ -3,9 +3,13 @@
 //! Parameter `i` of a kernel is the storage buffer `@group(0) @binding(i)`; a named global is a `var<uniform>` of any
 //! other group. Everything else (textures, immediates, storage elsewhere) is refused when an entry point uses it.
 
-use std::collections::BTreeMap;
+use std::{borrow::Cow, collections::BTreeMap};
 
-use naga::{AddressSpace, StorageAccess, TypeInner};
+use farm_core::device::DeviceKind;
+use naga::{
+    AddressSpace, StorageAccess, TypeInner, WithSpan,
+    valid::{Capabilities, ModuleInfo, ValidationError, ValidationFlags, Validator},
+};
 
 use super::{adapter::Gpu, scope::Refusal, trusted};
 
@@ -22,8 +26,20 @@ pub(crate) struct Module {
     pub(crate) globals: BTreeMap<String, Global>,
     /// Every binding of group 0, used or not.
     pub(crate) parameters: Vec<u32>,
+    /// Where the device reads named globals from.
+    pub(crate) globals_in: GlobalsIn,
     /// `override` constants: name in the text, and the key that the compiler wants.
     overrides: BTreeMap<String, String>,
+}
+
+/// Where a device reads named globals from.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum GlobalsIn {
+    /// As the text says.
+    Uniforms,
+    /// From storage buffers that are only read: lavapipe compiles a kernel anew for each value of a uniform that decides
+    /// where it goes, and keeps them all (2.7 MB for each job of a render).
+    Storage,
 }
 
 /// What one entry point uses.
@@ -68,15 +84,17 @@ impl Module {
             std::str::from_utf8(bytes).map_err(|error| invalid(format!("no UTF-8 text: {error}")))?;
         let parsed = naga::front::wgsl::parse_str(source)
             .map_err(|error| invalid(located(&error.emit_to_string(source))))?;
-        let mut validator = naga::valid::Validator::new(
-            naga::valid::ValidationFlags::all(),
-            naga::valid::Capabilities::all(),
-        );
-        let info =
-            validator.validate(&parsed).map_err(|error| invalid(located(&error.emit_to_string(source))))?;
+        let info = validated(&parsed).map_err(|error| invalid(located(&error.emit_to_string(source))))?;
         let reflected = reflect(&parsed, &info);
+        let on_storage = (gpu.kind == DeviceKind::Cpu)
+            .then(|| globals_on_storage(parsed, gpu.limits.max_storage_buffers_per_shader_stage, &reflected))
+            .flatten();
+        let globals_in = if on_storage.is_some() { GlobalsIn::Storage } else { GlobalsIn::Uniforms };
         let shader = gpu.scoped(|| {
-            let source = wgpu::ShaderSource::Wgsl(source.into());
+            let source = match on_storage {
+                Some(module) => wgpu::ShaderSource::Naga(Cow::Owned(module)),
+                None => wgpu::ShaderSource::Wgsl(source.into()),
+            };
             let descriptor = wgpu::ShaderModuleDescriptor { label: None, source };
             if unchecked {
                 trusted::create_shader_module_unchecked(&gpu.device, descriptor)
@@ -85,13 +103,36 @@ impl Module {
             }
         })?;
         let Reflected { entries, globals, parameters, overrides } = reflected;
-        Ok(Self { shader, entries, globals, parameters, overrides })
+        Ok(Self { shader, entries, globals, parameters, globals_in, overrides })
     }
 
     /// The compiler's key of an `override` constant.
     pub(crate) fn override_key(&self, name: &str) -> Option<&str> {
         self.overrides.get(name).map(String::as_str)
     }
+}
+
+fn validated(module: &naga::Module) -> Result<ModuleInfo, WithSpan<ValidationError>> {
+    Validator::new(ValidationFlags::all(), Capabilities::all()).validate(module)
+}
+
+/// The module with its named globals as read-only storage buffers; none where that is more than a device binds, or where
+/// the text names pointers to uniforms.
+fn globals_on_storage(
+    mut module: naga::Module,
+    max_storage_buffers: u32,
+    reflected: &Reflected,
+) -> Option<naga::Module> {
+    let most = reflected.entries.values().map(|entry| entry.parameters.len() + entry.globals.len()).max()?;
+    if most > usize::try_from(max_storage_buffers).unwrap_or(usize::MAX) {
+        return None;
+    }
+    for (_, variable) in module.global_variables.iter_mut() {
+        if variable.space == AddressSpace::Uniform {
+            variable.space = AddressSpace::Storage { access: StorageAccess::LOAD };
+        }
+    }
+    validated(&module).is_ok().then_some(module)
 }
 
 /// naga's message without its trailing blank lines.
@@ -106,7 +147,7 @@ struct Reflected {
     overrides: BTreeMap<String, String>,
 }
 
-fn reflect(module: &naga::Module, info: &naga::valid::ModuleInfo) -> Reflected {
+fn reflect(module: &naga::Module, info: &ModuleInfo) -> Reflected {
     let size_of = |ty: naga::Handle<naga::Type>| match module.types[ty].inner {
         TypeInner::Array { size: naga::ArraySize::Dynamic, stride, .. } => u64::from(stride),
         ref inner => u64::from(inner.size(module.to_ctx())),
@@ -194,11 +235,7 @@ mod tests {
 
     fn reflected(source: &str) -> Reflected {
         let module = naga::front::wgsl::parse_str(source).unwrap();
-        let mut validator = naga::valid::Validator::new(
-            naga::valid::ValidationFlags::all(),
-            naga::valid::Capabilities::all(),
-        );
-        let info = validator.validate(&module).unwrap();
+        let info = validated(&module).unwrap();
         reflect(&module, &info)
     }
 

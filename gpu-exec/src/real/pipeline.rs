@@ -9,7 +9,7 @@ use farm_core::{id::ContentHash, message::JobFailure};
 
 use super::{
     adapter::Gpu,
-    module::{EntryPoint, Global, Module},
+    module::{EntryPoint, Global, GlobalsIn, Module},
     pace::Pace,
 };
 use crate::executor::ExecutorConfig;
@@ -191,8 +191,12 @@ fn group_layouts(gpu: &Gpu, module: &Module, entry: &EntryPoint) -> Vec<Option<w
         let ty = wgpu::BufferBindingType::Storage { read_only: !parameter.writable };
         groups.entry(0).or_default().push(buffer(binding, ty, parameter.least_bytes));
     }
+    let globals_type = match module.globals_in {
+        GlobalsIn::Uniforms => wgpu::BufferBindingType::Uniform,
+        GlobalsIn::Storage => wgpu::BufferBindingType::Storage { read_only: true },
+    };
     for global in entry.globals.iter().filter_map(|name| module.globals.get(name)) {
-        let layout = buffer(global.binding, wgpu::BufferBindingType::Uniform, global.size_bytes);
+        let layout = buffer(global.binding, globals_type, global.size_bytes);
         groups.entry(global.group).or_default().push(layout);
     }
     let count = groups.keys().next_back().map_or(0, |last| last + 1);

@@ -263,7 +263,7 @@ impl<'a> Preparation<'a> {
     fn allocate(&mut self) -> Result<(), JobFailure> {
         let order = self.order;
         let (mut staging_bytes, mut device_touched) = (0_u64, false);
-        let alignment = self.uniform_alignment();
+        let alignment = self.gpu.global_alignment();
         let mut fills = self.gpu.device.create_command_encoder(&wgpu::CommandEncoderDescriptor::default());
         for (index, command) in order.program.commands().iter().enumerate() {
             match command {
@@ -337,7 +337,7 @@ impl<'a> Preparation<'a> {
                     }
                 }
                 Command::GlobalHtoD { kernel, name, bytes } => {
-                    let alignment = self.uniform_alignment();
+                    let alignment = self.gpu.global_alignment();
                     let offset_bytes = stage(&mut staged, bytes, alignment);
                     self.set_global(index, *kernel, name, offset_bytes, bytes.len() as u64)?;
                 }
@@ -484,10 +484,6 @@ impl<'a> Preparation<'a> {
 
     fn kernel(&mut self, index: usize, kernel: Kernel) -> Result<&mut KernelState, JobFailure> {
         self.kernels.get_mut(&kernel).ok_or_else(|| invalid(index, &format!("no kernel {}", kernel.0)))
-    }
-
-    fn uniform_alignment(&self) -> u64 {
-        u64::from(self.gpu.limits.min_uniform_buffer_offset_alignment)
     }
 }
 
