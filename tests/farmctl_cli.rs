@@ -122,6 +122,18 @@ fn an_unwritable_output_is_refused_before_rendering() {
 }
 
 #[test]
+fn a_folder_that_takes_no_results_is_refused_before_computing() {
+    let folder = TempDir::new().expect("a temporary folder");
+    let alignment = folder.path().join("a.txt");
+    fs::write(&alignment, "ACDE\nACCE\n").expect("the folder can be written");
+    let alignment = alignment.display().to_string();
+    // Nobody can write there, and nobody answers: the folder is looked at first.
+    let run = farmctl(["--coordinator", &dead_address(), "mi", &alignment, "-o", "/proc"]);
+    assert_eq!(run.status.code(), Some(1), "{}", text(&run.stderr));
+    assert!(text(&run.stderr).contains("/proc"), "{}", text(&run.stderr));
+}
+
+#[test]
 fn wrong_usage_is_exit_code_2() {
     for arguments in [
         vec!["fly-to-the-moon"],

@@ -24,7 +24,7 @@ fn start_both(farm: &Farm, folder: &Path) -> [Process; 2] {
         |row| format!(">s{row}\n{}\n", (0..60).map(|column| residue(row, column)).collect::<String>());
     fs::write(folder.join("alignment.fasta"), (0..60).map(sequence).collect::<String>()).expect("it is ours");
     let (image, alignment, out) = (path("image.exr"), path("alignment.fasta"), path("mi"));
-    let render = ["render", &scene, "-o", &image, "--size", "128x128", "--spp", "8"];
+    let render = ["render", &scene, "-o", &image, "--size", "128x128", "--spp", "24"];
     let information = ["mi", &alignment, "-o", &out, "--iterations", "400"];
     [&render[..], &information[..]]
         .map(|verb| Process::start("farmctl", ["--coordinator", &farm.grpc].iter().chain(verb)))

@@ -65,7 +65,7 @@ pub enum OutputError {
         path: PathBuf,
     },
     /// The folder takes no file, or the disk none of this size.
-    #[error("{}: cannot be written: {source}", path.display())]
+    #[error("{}: cannot be written", path.display())]
     Write {
         /// As given.
         path: PathBuf,

@@ -85,7 +85,7 @@ impl CoordinatorOptions {
 #[derive(Debug, Error)]
 pub enum StartError {
     /// An address cannot be had.
-    #[error("cannot listen on {address} ({what}): {source}")]
+    #[error("cannot listen on {address} ({what})")]
     Listen {
         /// `gRPC` or `HTTP`.
         what: &'static str,
@@ -214,12 +214,12 @@ async fn listen(what: &'static str, address: SocketAddr) -> Result<(TcpListener,
 }
 
 async fn serve_grpc(listener: TcpListener, sessions: Sessions, mut stop: watch::Receiver<()>) {
-    use proto::control::{admin_server, apps_server, incoming, nodes_server, server};
+    use proto::control::{Incoming, admin_server, apps_server, nodes_server, server};
     let served = server()
         .add_service(apps_server(sessions.clone()))
         .add_service(nodes_server(sessions.clone()))
         .add_service(admin_server(sessions))
-        .serve_with_incoming_shutdown(incoming(listener), async move {
+        .serve_with_incoming_shutdown(Incoming::of(listener), async move {
             // The error is the signal: the handle is gone.
             let _ = stop.changed().await;
         })
@@ -230,10 +230,11 @@ async fn serve_grpc(listener: TcpListener, sessions: Sessions, mut stop: watch::
 }
 
 async fn serve_http(listener: TcpListener, owner: OwnerHandle, mut stop: watch::Receiver<()>) {
-    let served = axum::serve(listener, web::router(owner)).with_graceful_shutdown(async move {
-        // The error is the signal: the handle is gone.
-        let _ = stop.changed().await;
-    });
+    let served =
+        axum::serve(web::Listener::of(listener), web::router(owner)).with_graceful_shutdown(async move {
+            // The error is the signal: the handle is gone.
+            let _ = stop.changed().await;
+        });
     if let Err(error) = served.await {
         tracing::error!(%error, "the HTTP server ended");
     }

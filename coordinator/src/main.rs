@@ -24,7 +24,12 @@ fn main() -> ExitCode {
         return coordinator::policy_host::serve(object);
     }
     let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new("info"));
-    tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).init();
+    // A log that cannot be written must not end the daemon.
+    tracing_subscriber::fmt()
+        .with_env_filter(filter)
+        .with_writer(std::io::stderr)
+        .log_internal_errors(false)
+        .init();
     let options = match settings::options(arguments) {
         Ok(options) => options,
         Err(error) => return failed(EXIT_USAGE, &error),
@@ -36,7 +41,8 @@ fn main() -> ExitCode {
 }
 
 fn failed(code: u8, error: &anyhow::Error) -> ExitCode {
-    eprintln!("farm-coordinator: {error:#}");
+    // Nobody may be left to read it.
+    let _ = writeln!(std::io::stderr(), "farm-coordinator: {error:#}");
     ExitCode::from(code)
 }
 

@@ -1,6 +1,14 @@
 //! The one command line of Gleaner. Raw arguments become checked ones in `cli`, verbs are in `command`, output is a
 //! function of data in `output`.
 
+/// Says something on stderr; a stderr that is full or closed changes nothing of what is done.
+macro_rules! tell {
+    ($($words:tt)*) => {{
+        use std::io::Write as _;
+        let _ = writeln!(std::io::stderr(), $($words)*);
+    }};
+}
+
 mod admin;
 mod bench;
 mod cli;
@@ -29,11 +37,12 @@ fn main() -> ExitCode {
     tracing_subscriber::fmt()
         .with_env_filter(EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new("error")))
         .with_writer(std::io::stderr)
+        .log_internal_errors(false)
         .init();
     match run(&cli) {
         Ok(()) => ExitCode::SUCCESS,
         Err(failure) => {
-            eprintln!("farmctl: {}", failure.describe());
+            tell!("farmctl: {}", failure.describe());
             failure.exit_code()
         }
     }

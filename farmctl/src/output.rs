@@ -31,6 +31,15 @@ pub(crate) fn print_text(text: &str) -> Result<(), Failure> {
     }
 }
 
+/// What a run's last line says of jobs that got more than one attempt; nothing if none did.
+pub(crate) fn moved(attempts: u64) -> String {
+    match attempts {
+        0 => String::new(),
+        1 => ", 1 job moved or run again".to_owned(),
+        _ => format!(", {attempts} jobs moved or run again"),
+    }
+}
+
 /// An empty table with a header and no lines.
 pub(crate) fn table<const N: usize>(header: [&str; N]) -> Table {
     let mut table = Table::new();

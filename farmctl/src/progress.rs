@@ -137,7 +137,7 @@ async fn tell_waits(progress: &mut watch::Receiver<Progress>) {
     loop {
         let waiting = progress.borrow_and_update().waiting;
         if let Some(reason) = waiting.filter(|_| waiting != told) {
-            eprintln!("farmctl: waiting: {}", wait_words(reason));
+            tell!("farmctl: waiting: {}", wait_words(reason));
         }
         told = waiting;
         if progress.changed().await.is_err() {

@@ -26,7 +26,7 @@ pub(crate) async fn run_graph(
         tokio::select! {
             result = &mut running => result,
             () = stops.recv() => {
-                eprintln!("farmctl: stopping; again to end at once");
+                tell!("farmctl: stopping; again to end at once");
                 stop.stop();
                 tokio::select! {
                     result = &mut running => result,

@@ -6,6 +6,7 @@ pub mod sim;
 use std::{
     env,
     ffi::OsStr,
+    fs::OpenOptions,
     io::{BufRead, BufReader, Read},
     path::PathBuf,
     process::{Child, ChildStdout, Command, ExitStatus, Output, Stdio},
@@ -67,20 +68,37 @@ impl Process {
     /// # Panics
     /// It cannot be started.
     pub fn start<S: AsRef<OsStr>>(name: &str, arguments: impl IntoIterator<Item = S>) -> Self {
+        Self::start_with(name, arguments, Stdio::piped())
+    }
+
+    /// Starts a workspace binary whose stderr cannot be written, as on a full disk.
+    ///
+    /// # Panics
+    /// It cannot be started.
+    pub fn start_muted<S: AsRef<OsStr>>(name: &str, arguments: impl IntoIterator<Item = S>) -> Self {
+        let full = OpenOptions::new().write(true).open("/dev/full").expect("Linux has /dev/full");
+        Self::start_with(name, arguments, full.into())
+    }
+
+    fn start_with<S: AsRef<OsStr>>(
+        name: &str,
+        arguments: impl IntoIterator<Item = S>,
+        stderr: Stdio,
+    ) -> Self {
         let mut child = Command::new(binary(name))
             .args(arguments)
             .env_remove("GLEANER_COORDINATOR")
             .stdin(Stdio::null())
             .stdout(Stdio::piped())
-            .stderr(Stdio::piped())
+            .stderr(stderr)
             .spawn()
             .expect("the binary starts");
         let lines = read_lines(child.stdout.take().expect("stdout is piped"));
-        let mut errors = child.stderr.take().expect("stderr is piped");
+        let errors = child.stderr.take();
         let stderr = thread::spawn(move || {
             let mut text = Vec::new();
             // A child that dies closes the pipe; what came before is what there is to show.
-            let _ = errors.read_to_end(&mut text);
+            let _ = errors.map(|mut errors| errors.read_to_end(&mut text));
             String::from_utf8_lossy(&text).into_owned()
         });
         Self { name: name.to_owned(), child, lines, stderr: Some(stderr) }

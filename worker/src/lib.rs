@@ -94,7 +94,7 @@ pub enum StartError {
     #[error(transparent)]
     Listen(#[from] BindError),
     /// The cache folder cannot be used.
-    #[error("cache folder {}: {source}", path.display())]
+    #[error("cache folder {} cannot be used", path.display())]
     Cache {
         /// Which.
         path: PathBuf,
@@ -102,7 +102,7 @@ pub enum StartError {
         source: std::io::Error,
     },
     /// The coordinator cannot be reached. May be retried.
-    #[error("{0} (tried for {1:?})")]
+    #[error("no coordinator answered within {1:?}")]
     Unreachable(#[source] SessionError, Duration),
     /// The coordinator does not want this node.
     #[error("the coordinator refused this node: {reason}")]

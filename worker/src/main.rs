@@ -24,7 +24,12 @@ fn main() -> ExitCode {
     // clap exits with 2 by itself.
     let arguments = Arguments::parse();
     let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new("info,wgpu_hal=error"));
-    tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).init();
+    // A log that cannot be written must not end the daemon.
+    tracing_subscriber::fmt()
+        .with_env_filter(filter)
+        .with_writer(std::io::stderr)
+        .log_internal_errors(false)
+        .init();
     let options = match settings::options(arguments) {
         Ok(options) => options,
         Err(error) => return failed(EXIT_USAGE, &error),
@@ -36,7 +41,8 @@ fn main() -> ExitCode {
 }
 
 fn failed(code: u8, error: &anyhow::Error) -> ExitCode {
-    eprintln!("farm-worker: {error:#}");
+    // Nobody may be left to read it.
+    let _ = writeln!(std::io::stderr(), "farm-worker: {error:#}");
     ExitCode::from(code)
 }
 

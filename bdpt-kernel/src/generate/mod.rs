@@ -76,7 +76,7 @@ pub enum GenerateError {
         folder: PathBuf,
     },
     /// A file cannot be written.
-    #[error("{}: cannot be written: {source}", path.display())]
+    #[error("{}: cannot be written", path.display())]
     Write {
         /// The file or folder.
         path: PathBuf,

@@ -33,7 +33,7 @@ pub enum SceneError {
         path: PathBuf,
     },
     /// A file cannot be read.
-    #[error("{place}: cannot be read: {source}")]
+    #[error("{place}: cannot be read")]
     Read {
         /// The file, or the line that names it.
         place: Place,

@@ -43,10 +43,15 @@ pub fn serve(path: &Path) -> ExitCode {
     match Pipes::take().and_then(|pipes| answer_all(path, pipes)) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
-            eprintln!("policy host: {error}");
+            complain(&error);
             ExitCode::FAILURE
         }
     }
+}
+
+/// Says what went wrong, to whoever still reads.
+fn complain(error: &impl std::fmt::Display) {
+    let _ = writeln!(io::stderr(), "policy host: {error}");
 }
 
 /// The coordinator's ends. The plug-in sees others: nothing on stdin, and a stdout that is stderr.
@@ -101,7 +106,7 @@ fn read_all(questions: File, lines: &mpsc::SyncSender<Vec<u8>>) {
             }
             Ok(None) => break,
             Err(error) => {
-                eprintln!("policy host: {error}");
+                complain(&error);
                 break;
             }
         }

@@ -3,6 +3,8 @@
 mod metrics;
 mod page;
 
+use std::{io, net::SocketAddr};
+
 use axum::{
     Json, Router,
     extract::State,
@@ -11,8 +13,40 @@ use axum::{
     routing::get,
 };
 use farm_core::coordinator::FarmStatus;
+use proto::control::Incoming;
+use tokio::net::{TcpListener, TcpStream};
 
 use crate::owner::OwnerHandle;
+
+/// The HTTP listener: connections whose peers speak.
+#[derive(Debug)]
+pub(crate) struct Listener {
+    incoming: Incoming,
+    address: io::Result<SocketAddr>,
+}
+
+impl Listener {
+    pub(crate) fn of(listener: TcpListener) -> Self {
+        Self { address: listener.local_addr(), incoming: Incoming::of(listener) }
+    }
+}
+
+impl axum::serve::Listener for Listener {
+    type Io = TcpStream;
+    type Addr = SocketAddr;
+
+    async fn accept(&mut self) -> (TcpStream, SocketAddr) {
+        match self.incoming.accept().await {
+            Some(accepted) => accepted,
+            // The accepting task lives as long as this: only a runtime that ends takes it away.
+            None => std::future::pending().await,
+        }
+    }
+
+    fn local_addr(&self) -> io::Result<SocketAddr> {
+        self.address.as_ref().copied().map_err(|error| error.kind().into())
+    }
+}
 
 /// The routes.
 pub(crate) fn router(owner: OwnerHandle) -> Router {

@@ -6,8 +6,8 @@
 use std::collections::BTreeMap;
 
 use super::{
-    CoordinatorMachine,
-    model::{App, Batch, Job, JobState, Pending, Placement},
+    CoordinatorMachine, NodeState,
+    model::{App, Batch, Job, JobState, Node, Pending, Placement},
     policy::{Choice, Fcfs, LongestFirst, PlacementPolicy, Policy, Question, QuestionDevice, QuestionJob},
     rates::{Load, Module},
 };
@@ -309,7 +309,12 @@ impl CoordinatorMachine {
     }
 
     fn say_waiting(&mut self, id: AppId, batch: BatchId) {
-        let reason = if self.nodes.is_empty() { WaitReason::NoNode } else { WaitReason::NoFittingDevice };
+        // One that leaves is as good as gone.
+        let stays = |node: &Node| node.state != NodeState::Draining;
+        let reason = match self.nodes.values().any(stays) {
+            true => WaitReason::NoFittingDevice,
+            false => WaitReason::NoNode,
+        };
         let Some(app) = self.apps.get_mut(&id).filter(|app| app.link.is_some()) else { return };
         let Some(waiting) = app.batches.get_mut(&batch) else { return };
         if waiting.told.replace(reason) != Some(reason) {

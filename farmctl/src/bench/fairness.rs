@@ -274,7 +274,7 @@ fn tell(shares: &Shares) {
         let percent = |part: f64| format!("{:.2}", 100.0 * part);
         table.add_row([weight.to_string(), percent(weight / total_weight), percent(received_s / total_s)]);
     }
-    eprintln!("{table}\n{} jobs in {COUNTED:?}", shares.jobs);
+    tell!("{table}\n{} jobs in {COUNTED:?}", shares.jobs);
 }
 
 #[cfg(test)]

@@ -50,7 +50,7 @@ pub(super) struct Setup<'a> {
 pub(super) async fn measure(setup: &Setup<'_>) -> anyhow::Result<Vec<Figure>> {
     let set = setup.set;
     let alignment = tokio::task::spawn_blocking(move || generated(&set)).await??;
-    eprintln!("{alignment}");
+    tell!("{alignment}");
     let mut figures = Vec::new();
     if !setup.devices.is_empty() {
         figures.extend(on_devices(setup, &alignment).await?);
@@ -100,7 +100,7 @@ async fn on_devices(setup: &Setup<'_>, alignment: &Arc<Alignment>) -> anyhow::Re
             best = (count > 1).then_some((count, speed_up));
         }
     }
-    eprintln!("{table}");
+    tell!("{table}");
     Ok(best.map(|(count, speed_up)| {
         Figure::new("mi_speed_up", speed_up, "x", Better::Higher, LEAST_EFFICIENCY * count as f64)
     }))
@@ -126,7 +126,7 @@ async fn over_the_network(setup: &Setup<'_>, alignment: &Arc<Alignment>) -> anyh
             ]);
         }
     }
-    eprintln!("{table}");
+    tell!("{table}");
     Ok(Figure::new("mi_network_overhead_worst", worst_s, "s", Better::Lower, THESIS_OVERHEAD_S))
 }
 

@@ -86,7 +86,7 @@ impl Figure {
 /// Measures, prints, and fails when a figure misses its bar.
 pub(crate) async fn run(arguments: &BenchArgs, format: Format) -> Result<(), Failure> {
     let mut stops = Stops::listen()?;
-    eprintln!("seed {}", arguments.seed);
+    tell!("seed {}", arguments.seed);
     let figures = tokio::select! {
         figures = Box::pin(measure(arguments)) => figures?,
         // The measurement is dropped, and its processes with it.

@@ -56,7 +56,7 @@ pub(super) async fn measure(runs: usize) -> anyhow::Result<Vec<Figure>> {
             format!("{over_ideal:.4}"),
         ]);
     }
-    eprintln!("{table}");
+    tell!("{table}");
     let by_devices = speed_ups[DEVICE_COUNTS.len() - 1];
     let by_nodes = speed_ups[speed_ups.len() - 1];
 

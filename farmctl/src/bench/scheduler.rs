@@ -60,7 +60,7 @@ pub(super) async fn measure(runs: usize) -> anyhow::Result<Vec<Figure>> {
 }
 
 fn tell(cpu: &CpuTime, microseconds: impl Fn(Duration) -> f64) {
-    eprintln!(
+    tell!(
         "CPU a job: application {:.1} us, coordinator {:.1} us, both workers {:.1} us",
         microseconds(cpu.application),
         microseconds(cpu.coordinator),

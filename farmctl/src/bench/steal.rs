@@ -132,7 +132,7 @@ pub(super) async fn measure(seed: u64, runs: usize, pictures: Option<&Path>) -> 
         let second_frame = second_frame_ms / bound_ms;
         figures.push(Figure::new(setting.second_frame, second_frame, "ratio", Better::Lower, 1.04));
     }
-    eprintln!("{table}");
+    tell!("{table}");
     for (name, gaps_ms, bar_ms) in [
         ("steal_latency_p95_local", &gaps.local_ms, 5.0),
         ("steal_latency_p95_global", &gaps.global_ms, 25.0),

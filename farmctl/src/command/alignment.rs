@@ -1,7 +1,7 @@
 //! `farmctl alignment`: writes a random alignment, of the sizes of the thesis' sets or of any other.
 
 use std::{
-    fs::File,
+    fs::{self, File},
     io::{BufWriter, Write as _},
 };
 
@@ -30,6 +30,11 @@ pub(crate) fn run(arguments: &AlignmentArgs) -> Result<(), Failure> {
     };
     let shown = || path.display().to_string();
     let mut out = BufWriter::new(File::create(path).with_context(shown)?);
-    alignment.write_fasta(&mut out).and_then(|()| out.flush()).with_context(shown)?;
+    let written = alignment.write_fasta(&mut out).and_then(|()| out.flush());
+    if written.is_err() && path.is_file() {
+        // Half an alignment may pass for a whole one. That it cannot be removed either changes nothing.
+        let _ = fs::remove_file(path);
+    }
+    written.with_context(shown)?;
     print_text(&format!("{}\n", path.display()))
 }

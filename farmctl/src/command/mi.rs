@@ -16,12 +16,13 @@ use mi_kernel::{
     output, parse, saved,
 };
 use serde_json::json;
+use tempfile::NamedTempFile;
 
 use crate::{
     cli::{Gaps, MiArgs, MiMode, ProgressStyle},
     embedded::EmbeddedFarm,
     failure::Failure,
-    output::print_text,
+    output::{moved, print_text},
     progress::{Early, Units},
     running::{Stops, run_graph},
 };
@@ -119,9 +120,9 @@ fn read(arguments: &MiArgs) -> Result<Input, Failure> {
     let bytes = fs::read(&arguments.alignment).with_context(|| shown(&arguments.alignment))?;
     let text = decompressed(&bytes, MAX_INPUT_BYTES).with_context(|| shown(&arguments.alignment))?;
     let parsed = parse(text.as_deref().unwrap_or(&bytes)).with_context(|| shown(&arguments.alignment))?;
-    eprintln!("farmctl: {}: {}, {}", shown(&arguments.alignment), parsed.notes.format, parsed.alignment);
+    tell!("farmctl: {}: {}, {}", shown(&arguments.alignment), parsed.notes.format, parsed.alignment);
     if parsed.notes.duplicate_names > 0 {
-        eprintln!("farmctl: warning: {} names occur more than once", parsed.notes.duplicate_names);
+        tell!("farmctl: warning: {} names occur more than once", parsed.notes.duplicate_names);
     }
     let filters = Filters {
         min_coverage: arguments.min_coverage,
@@ -134,7 +135,7 @@ fn read(arguments: &MiArgs) -> Result<Input, Failure> {
         false => filters.apply(&parsed.alignment).with_context(|| shown(&arguments.alignment))?,
     };
     if [alignment.n(), alignment.l()] != read {
-        eprintln!("farmctl: the filters leave {alignment}");
+        tell!("farmctl: the filters leave {alignment}");
     }
     let alignment = alignment.with_gaps(match arguments.gaps {
         Gaps::Ormi => GapMode::Ormi,
@@ -143,6 +144,8 @@ fn read(arguments: &MiArgs) -> Result<Input, Failure> {
         Gaps::Esmi => GapMode::Esmi,
     });
     fs::create_dir_all(&arguments.folder).with_context(|| shown(&arguments.folder))?;
+    // Better now than after hours: a folder that cannot be written to.
+    drop(NamedTempFile::new_in(&arguments.folder).with_context(|| shown(&arguments.folder))?);
     let path = arguments.folder.join(SUMS);
     let earlier = match (fs::read(&path), arguments.extend) {
         (Ok(_), false) => {
@@ -198,7 +201,7 @@ async fn finish(
     };
     let done = handle.iterations_done();
     let Some(observed) = handle.observed().filter(|_| failure.is_none() || done > before) else {
-        eprintln!("farmctl: no iteration was added: nothing was written");
+        tell!("farmctl: no iteration was added: nothing was written");
         return Err(failure.unwrap_or_else(|| anyhow!("the run gave no scores").into()));
     };
     let results = Results {
@@ -243,7 +246,7 @@ async fn finish(
     let best =
         tokio::task::spawn_blocking(move || results.write(&record)).await.context("writing panicked")??;
     if let Some(failure) = failure {
-        eprintln!(
+        tell!(
             "farmctl: saved a partial result in {}: {done} of {} iterations; --extend goes on from it",
             shown(&arguments.folder),
             arguments.iterations
@@ -283,11 +286,11 @@ fn tell(summary: &RunSummary, arguments: &MiArgs, added: usize, best: &str) -> R
         });
         print_text(&format!("{line}\n"))?;
     }
-    eprintln!(
+    tell!(
         "farmctl: {} written: {added} iterations in {} jobs, {seconds:.1} s{}; {best}",
         shown(&arguments.folder),
         summary.jobs,
-        if summary.replanned > 0 { format!(", {} replanned", summary.replanned) } else { String::new() },
+        moved(summary.replanned),
     );
     Ok(())
 }
@@ -303,8 +306,15 @@ struct Results {
 }
 
 impl Results {
-    /// Writes all files, the sums last: whoever finds them finds the others. Gives the top pair in words.
+    /// Writes all files, the sums first: they alone cannot be made again. Gives the top pair in words.
     fn write(self, record: &serde_json::Value) -> anyhow::Result<String> {
+        let sums = saved::save(&self.alignment, self.seed, &self.sums);
+        place(&self.folder, SUMS, |out| out.write_all(&sums))?;
+        let kept = format!("the sums are in {}; --extend writes the rest", shown(&self.folder.join(SUMS)));
+        self.write_rest(record).context(kept)
+    }
+
+    fn write_rest(self, record: &serde_json::Value) -> anyhow::Result<String> {
         let reference = Reference::with_observed(&self.alignment, self.observed)?;
         let null = NullModel::new(&reference, self.seed, ShuffleKind::Feistel);
         let pairs = self.sums.statistics(&null);
@@ -324,8 +334,6 @@ impl Results {
         })?;
         let text = serde_json::to_string_pretty(record)? + "\n";
         place(&self.folder, "run.json", |out| out.write_all(text.as_bytes()))?;
-        let sums = saved::save(&self.alignment, self.seed, &self.sums);
-        place(&self.folder, SUMS, |out| out.write_all(&sums))?;
         let best = pairs.iter().max_by(|a, b| a.z.total_cmp(&b.z).then(a.mi_bits.total_cmp(&b.mi_bits)));
         Ok(best.map_or_else(String::new, |best| {
             let number = |column| self.alignment.number(column);

@@ -16,7 +16,7 @@ use crate::{
     cli::{ProgressStyle, RenderArgs},
     embedded::EmbeddedFarm,
     failure::Failure,
-    output::print_text,
+    output::{moved, print_text},
     progress::Units,
     running::{Stops, run_graph},
 };
@@ -80,10 +80,10 @@ pub(crate) async fn run(arguments: &RenderArgs, coordinator: Option<&str>) -> Re
 /// Warnings of the loader, for the one who made the scene.
 fn report(loaded: &LoadedScene) {
     for warning in &loaded.report.warnings {
-        eprintln!("farmctl: warning: {warning}");
+        tell!("farmctl: warning: {warning}");
     }
     if loaded.report.warnings_dropped > 0 {
-        eprintln!("farmctl: warning: {} further warnings", loaded.report.warnings_dropped);
+        tell!("farmctl: warning: {} further warnings", loaded.report.warnings_dropped);
     }
 }
 
@@ -113,11 +113,11 @@ async fn save_partial(render: &RenderHandle, arguments: &RenderArgs) -> Result<(
     let image = render.partial_image();
     let progress = render.progress();
     if progress.samples == 0 {
-        eprintln!("farmctl: nothing was rendered yet: no image was written");
+        tell!("farmctl: nothing was rendered yet: no image was written");
         return Ok(());
     }
     write_images(image, arguments).await?;
-    eprintln!("farmctl: saved a partial image: {} of {} samples", progress.samples, progress.total_samples);
+    tell!("farmctl: saved a partial image: {} of {} samples", progress.samples, progress.total_samples);
     Ok(())
 }
 
@@ -131,7 +131,7 @@ async fn write_images(image: Image, arguments: &RenderArgs) -> Result<(), Failur
     let mut failures = written.await.context("writing the image panicked")?.into_iter();
     let Some(first) = failures.next() else { return Ok(()) };
     for failure in failures {
-        eprintln!("farmctl: {failure}");
+        tell!("farmctl: {failure}");
     }
     Err(first.into())
 }
@@ -139,7 +139,7 @@ async fn write_images(image: Image, arguments: &RenderArgs) -> Result<(), Failur
 fn tell_summary(summary: &RunSummary, render: &RenderHandle, arguments: &RenderArgs) -> Result<(), Failure> {
     let film = render.progress();
     for (what, count) in film.counters.faults() {
-        eprintln!("farmctl: warning: {count} {what} while rendering");
+        tell!("farmctl: warning: {count} {what} while rendering");
     }
     let prepare: Duration = summary.tasks.iter().map(|task| task.prepare_time).sum();
     let seconds = summary.wall_time.saturating_sub(prepare).as_secs_f64();
@@ -162,13 +162,13 @@ fn tell_summary(summary: &RunSummary, render: &RenderHandle, arguments: &RenderA
         print_text(&format!("{line}\n"))?;
     }
     let images: Vec<String> = arguments.images.iter().map(|path| path.display().to_string()).collect();
-    eprintln!(
+    tell!(
         "farmctl: {} written: {} jobs in {seconds:.1} s, {:.3} M samples/s, {:.2} M rays/s{}",
         images.join(", "),
         summary.jobs,
         samples_per_second / 1e6,
         rays_per_second / 1e6,
-        if summary.replanned > 0 { format!(", {} jobs replanned", summary.replanned) } else { String::new() },
+        moved(summary.replanned),
     );
     Ok(())
 }

@@ -28,16 +28,13 @@ pub(crate) async fn run(arguments: &UpArgs) -> Result<(), Failure> {
         })).collect::<Vec<_>>(),
     });
     output::print_text(&format!("{ready}\n"))?;
-    eprintln!(
-        "farmctl: the farm is up; status page http://{}; Ctrl-C ends it",
-        farm.coordinator().http_addr()
-    );
+    tell!("farmctl: the farm is up; status page http://{}; Ctrl-C ends it", farm.coordinator().http_addr());
 
     tokio::select! {
         _ = interrupt.recv() => {}
         _ = terminate.recv() => {}
     }
-    eprintln!("farmctl: draining; again to end at once");
+    tell!("farmctl: draining; again to end at once");
     tokio::select! {
         () = farm.stop() => Ok(()),
         _ = interrupt.recv() => Err(Failure::Work(anyhow::anyhow!("ended before the farm was drained"))),

@@ -3,6 +3,7 @@
 //! It owns message shapes, their caps and the connection settings that both ends share; it never decides what to say.
 
 mod convert;
+mod incoming;
 mod session;
 mod transport;
 
@@ -27,11 +28,10 @@ pub use self::{
         MAX_ADDRESSES, MAX_CERTIFICATE_BYTES, MAX_CONTENTS, MAX_ENTRIES, MAX_JOBS, MAX_NAME_BYTES,
         MAX_TEXT_BYTES, WireError,
     },
+    incoming::Incoming,
     session::{
         Heard, QUEUED_MESSAGES, Session, SessionError, SessionReceiver, SessionSender, connect_app,
         connect_node, drain, status, timeline,
     },
-    transport::{
-        ADMIN_TIMEOUT, MAX_MESSAGE_BYTES, admin_server, apps_server, incoming, nodes_server, server,
-    },
+    transport::{ADMIN_TIMEOUT, MAX_MESSAGE_BYTES, admin_server, apps_server, nodes_server, server},
 };

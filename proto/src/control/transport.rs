@@ -2,8 +2,7 @@
 
 use std::time::Duration;
 
-use tokio::net::TcpListener;
-use tonic::transport::{Endpoint, Server, server::TcpIncoming};
+use tonic::transport::{Endpoint, Server};
 
 use super::{SessionError, v1};
 
@@ -22,7 +21,7 @@ const CONNECTION_WINDOW_BYTES: u32 = 8 << 20;
 /// Sessions and requests of one connection at a time.
 const STREAMS_PER_CONNECTION: u32 = 64;
 
-/// A gRPC server with the farm's keepalive, windows and stream limits; serve it on [`incoming`].
+/// A gRPC server with the farm's keepalive, windows and stream limits; serve it on [`super::Incoming`].
 #[must_use]
 pub fn server() -> Server {
     Server::builder()
@@ -31,12 +30,6 @@ pub fn server() -> Server {
         .initial_stream_window_size(STREAM_WINDOW_BYTES)
         .initial_connection_window_size(CONNECTION_WINDOW_BYTES)
         .max_concurrent_streams(STREAMS_PER_CONNECTION)
-}
-
-/// The accepted connections of a listener, without Nagle's delay.
-#[must_use]
-pub fn incoming(listener: TcpListener) -> TcpIncoming {
-    TcpIncoming::from(listener).with_nodelay(Some(true))
 }
 
 /// The service of applications, with message caps.

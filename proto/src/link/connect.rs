@@ -52,7 +52,7 @@ const SHUTDOWN_TIMEOUT: Duration = Duration::from_secs(1);
 #[derive(Debug, Error)]
 pub enum BindError {
     /// The address cannot be had.
-    #[error("cannot listen on {address} (UDP): {source}")]
+    #[error("cannot listen on {address} (UDP)")]
     Address {
         /// The address asked for.
         address: SocketAddr,
