@@ -67,16 +67,16 @@ impl TestFarm {
 async fn a_large_content_leaves_the_application_once_for_many_nodes() {
     let farm = TestFarm::start(4, &["sim"]).await;
     let app = farm.connect().await;
-    const SIZE: usize = 12 << 20;
+    const SIZE: u32 = 12 << 20;
     let echoes = || Echoes {
         jobs: 40,
         cost: CostNs(20_000_000),
-        module: Some((0..SIZE / 4).flat_map(|word| (word as u32).to_le_bytes()).collect()),
+        module: Some((0..SIZE / 4).flat_map(u32::to_le_bytes).collect()),
         ..Echoes::default()
     };
     let summary = app.run(TaskGraph::new().task("echo", echoes())).await.unwrap();
     // Once, not four times; an overloaded machine may give a second node leave to ask here.
-    assert!((SIZE..3 * SIZE).contains(&usize::try_from(summary.uploaded_bytes).unwrap()), "{summary:?}");
+    assert!((SIZE..3 * SIZE).contains(&u32::try_from(summary.uploaded_bytes).unwrap()), "{summary:?}");
     let status = farm.coordinator.status().await.unwrap();
     assert!(
         status.nodes.iter().all(|node| node.devices[0].executed_jobs > 0),

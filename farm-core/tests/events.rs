@@ -52,7 +52,7 @@ fn attempt(app: u8, index: u8, sequence: u8) -> JobAttempt {
 }
 
 fn content(tag: u8) -> Content {
-    Content { hash: ContentHash([tag; 32]), size_bytes: if tag % 2 == 0 { 4 } else { 4 << 20 } }
+    Content { hash: ContentHash([tag; 32]), size_bytes: if tag.is_multiple_of(2) { 4 } else { 4 << 20 } }
 }
 
 fn device(speed: u8) -> DeviceInfo {

@@ -4,7 +4,10 @@
 //! Small contents come from the application at once. Of large ones the coordinator is asked where they should come from: a
 //! node that has them, or the application.
 
-use std::{collections::BTreeSet, time::Duration};
+use std::{
+    collections::{BTreeSet, btree_map::Entry},
+    time::Duration,
+};
 
 use super::{Effect, Provider, WorkerMachine, job::HeldState};
 use crate::{
@@ -71,11 +74,15 @@ impl WorkerMachine {
     ) -> usize {
         let mut missing = 0;
         for &content in contents {
-            if !self.contents.contains_key(&content.hash) {
+            if let Entry::Vacant(place) = self.contents.entry(content.hash) {
                 let state = ContentState::Wanted;
-                let holding =
-                    Holding { content, state, references: 0, waiting: BTreeSet::new(), failed_tries: 0 };
-                self.contents.insert(content.hash, holding);
+                place.insert(Holding {
+                    content,
+                    state,
+                    references: 0,
+                    waiting: BTreeSet::new(),
+                    failed_tries: 0,
+                });
                 if self.may_be_located(&content) {
                     self.ask_where(now, content);
                 }

@@ -112,8 +112,8 @@ impl Module {
     }
 }
 
-fn validated(module: &naga::Module) -> Result<ModuleInfo, WithSpan<ValidationError>> {
-    Validator::new(ValidationFlags::all(), Capabilities::all()).validate(module)
+fn validated(module: &naga::Module) -> Result<ModuleInfo, Box<WithSpan<ValidationError>>> {
+    Ok(Validator::new(ValidationFlags::all(), Capabilities::all()).validate(module)?)
 }
 
 /// The module with its named globals as read-only storage buffers; none where that is more than a device binds, or where
