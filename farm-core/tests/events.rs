@@ -183,6 +183,7 @@ fn worker_machine() -> WorkerMachine {
         devices: vec![device(1), device(1), device(2)],
         contact: contact(),
         max_jobs: 8,
+        spool_quota_bytes: 20,
         local_stealing: true,
         share: worker::Share::DEFAULT,
         seed: 1,

@@ -51,6 +51,8 @@ pub struct WorkerOptions {
     pub connect_timeout: Duration,
     /// Most bytes of task allocations and modules kept in memory.
     pub content_cache_bytes: u64,
+    /// Most bytes of results that an application may leave unacknowledged; beyond it no further job of it is begun.
+    pub spool_quota_bytes: u64,
     /// How long one job may run.
     pub job_limit: Duration,
     /// Whether an idle device takes queued jobs of its siblings; off only for measuring what that gains.
@@ -73,6 +75,7 @@ impl WorkerOptions {
             devices,
             connect_timeout: Duration::from_secs(10),
             content_cache_bytes: 4 << 30,
+            spool_quota_bytes: 1 << 30,
             job_limit: Duration::from_secs(600),
             local_stealing: true,
             share: Share::DEFAULT,
@@ -209,6 +212,7 @@ pub async fn start(options: WorkerOptions) -> Result<WorkerHandle, StartError> {
         devices: infos.clone(),
         contact: Contact { addresses: advertise, certificate_der: server.certificate_der().to_vec() },
         max_jobs: MAX_JOBS,
+        spool_quota_bytes: options.spool_quota_bytes,
         local_stealing: options.local_stealing,
         share: options.share,
         seed: identity,

@@ -87,6 +87,8 @@ struct ConfigFile {
     job_limit: Option<String>,
     /// Most bytes of task allocations and modules kept in memory.
     content_cache_bytes: Option<u64>,
+    /// Most bytes of results that an application may leave unacknowledged.
+    spool_quota_bytes: Option<u64>,
     /// How devices are shared between applications.
     #[serde(default)]
     share: Rule,
@@ -156,6 +158,7 @@ pub(crate) fn options(arguments: Arguments) -> anyhow::Result<WorkerOptions> {
             CONNECT_TIMEOUT,
         )?,
         content_cache_bytes: file.content_cache_bytes.unwrap_or(defaults.content_cache_bytes),
+        spool_quota_bytes: file.spool_quota_bytes.unwrap_or(defaults.spool_quota_bytes),
         job_limit: duration("job_limit", file.job_limit, defaults.job_limit)?,
         local_stealing: file.scheduler.local_stealing == Switch::On,
         share: match file.share {
@@ -274,7 +277,7 @@ mod tests {
     fn flags_overrule_the_file() {
         let config = "coordinator = 'a:1'\nlisten = '127.0.0.1:5'\nadvertise = ['b:2']\nname = 'n'\n\
                       device = ['cpu', 'gpu:1']\ncache = '/c'\nconnect_timeout = '5m'\njob_limit = '250ms'\n\
-                      content_cache_bytes = 77\nshare = 'stride'\n";
+                      content_cache_bytes = 77\nspool_quota_bytes = 78\nshare = 'stride'\n";
         let from_file = parse(&[], Some(config)).unwrap();
         assert_eq!((from_file.coordinator.as_str(), from_file.name.as_str()), ("a:1", "n"));
         assert_eq!(from_file.listen.to_string(), "127.0.0.1:5");
@@ -283,7 +286,7 @@ mod tests {
         assert_eq!(from_file.cache, Some(PathBuf::from("/c")));
         assert_eq!(from_file.connect_timeout, Duration::from_secs(300));
         assert_eq!(from_file.job_limit, Duration::from_millis(250));
-        assert_eq!(from_file.content_cache_bytes, 77);
+        assert_eq!((from_file.content_cache_bytes, from_file.spool_quota_bytes), (77, 78));
         assert!(from_file.local_stealing, "on unless it is switched off");
         assert_eq!(from_file.share, Share::Stride);
 

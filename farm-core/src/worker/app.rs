@@ -33,6 +33,17 @@ pub(super) struct App {
     pub(super) held_jobs: usize,
     /// Its jobs that could be staged, are staged or run: what makes it backlogged.
     pub(super) active_jobs: usize,
+    /// Bytes of its results that wait for acknowledgement.
+    pub(super) spool_bytes: u64,
+    /// It has a share of the devices now.
+    pub(super) awake: bool,
+}
+
+impl App {
+    /// Whether it leaves no more results behind than it may.
+    pub(super) const fn takes_results(&self, quota_bytes: u64) -> bool {
+        self.spool_bytes < quota_bytes
+    }
 }
 
 impl WorkerMachine {
@@ -193,6 +204,26 @@ impl WorkerMachine {
             Some(_) => Ok(()),
             None if self.apps.len() >= MAX_APPS => Err(format!("{MAX_APPS} applications are here already")),
             None => Ok(()),
+        }
+    }
+
+    /// An application has a share while it has something to run and takes its results.
+    pub(super) fn settle_share(&mut self, id: AppId) {
+        let Some(app) = self.apps.get_mut(&id) else { return };
+        let awake = app.active_jobs > 0 && app.takes_results(self.config.spool_quota_bytes);
+        match (std::mem::replace(&mut app.awake, awake), awake) {
+            (false, true) => self.lags.wake(id),
+            (true, false) => self.lags.rest(id),
+            (false, false) | (true, true) => {}
+        }
+    }
+
+    /// Its spool grew or shrank.
+    pub(super) fn spool_changed(&mut self, id: AppId, change: impl Fn(u64) -> u64) {
+        self.spool_bytes = change(self.spool_bytes);
+        if let Some(app) = self.apps.get_mut(&id) {
+            app.spool_bytes = change(app.spool_bytes);
+            self.settle_share(id);
         }
     }
 

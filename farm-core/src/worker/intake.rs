@@ -112,7 +112,10 @@ impl WorkerMachine {
             HeldState::HandedOver(_) => {
                 self.leave_executor(held.device, job.job);
             }
-            HeldState::Executed(spooled) => self.spool_bytes -= spooled.size_bytes,
+            HeldState::Executed(spooled) => {
+                let size_bytes = spooled.size_bytes;
+                self.spool_changed(job.job.app, |bytes| bytes - size_bytes);
+            }
         }
         self.release_contents(job, &held.contents);
         if let Some(app) = self.apps.get_mut(&job.job.app) {
@@ -132,17 +135,13 @@ impl WorkerMachine {
     pub(super) fn became_active(&mut self, id: AppId) {
         let Some(app) = self.apps.get_mut(&id) else { return };
         app.active_jobs += 1;
-        if app.active_jobs == 1 {
-            self.lags.wake(id);
-        }
+        self.settle_share(id);
     }
 
     pub(super) fn became_inactive(&mut self, id: AppId) {
         let Some(app) = self.apps.get_mut(&id) else { return };
         app.active_jobs -= 1;
-        if app.active_jobs == 0 {
-            self.lags.rest(id);
-        }
+        self.settle_share(id);
     }
 
     /// A job whose contents are all here gets into its device's queue.

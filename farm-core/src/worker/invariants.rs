@@ -6,11 +6,11 @@ use super::{
     WorkerMachine,
     content::ContentState,
     drain::Drain,
-    job::{HeldState, Phase},
+    job::{HeldJob, HeldState, Phase},
     report::Reports,
 };
 use crate::{
-    id::{ContentHash, DeviceIndex},
+    id::{AppId, ContentHash, DeviceIndex},
     message::LatencyClass,
 };
 
@@ -29,14 +29,7 @@ impl WorkerMachine {
         assert!(self.jobs.len() <= self.config.max_jobs, "I8: more than {} jobs", self.config.max_jobs);
         assert!(self.reports.kept() <= Reports::max_kept(), "I8: more reports are kept than allowed");
         self.tombstones.check_invariants();
-        let spooled: u64 = self
-            .jobs
-            .values()
-            .map(|held| match &held.state {
-                HeldState::Executed(spooled) => spooled.size_bytes,
-                HeldState::Fetching { .. } | HeldState::Queued | HeldState::HandedOver(_) => 0,
-            })
-            .sum();
+        let spooled: u64 = self.jobs.values().map(HeldJob::spooled_bytes).sum();
         assert_eq!(spooled, self.spool_bytes, "I8: the spool's size is the sum of its results");
     }
 
@@ -81,7 +74,11 @@ impl WorkerMachine {
                 "waiting jobs of {index}"
             );
             let idle = !device.lost && device.handed_over.is_empty();
-            assert!(!idle || device.queued_jobs == 0, "I6: {index} is idle while jobs are in its queue");
+            let quota_bytes = self.config.spool_quota_bytes;
+            let takes_results =
+                |app: &AppId| self.apps.get(app).is_some_and(|app| app.takes_results(quota_bytes));
+            let waits = device.queues().keys().any(takes_results);
+            assert!(!idle || !waits, "I6: {index} is idle while jobs are in its queue");
             assert!(
                 device.queues().values().all(|queue| !queue.is_empty()),
                 "I8: {index} keeps an empty queue"
@@ -130,6 +127,10 @@ impl WorkerMachine {
                 .filter(|held| matches!(held.state, HeldState::Queued | HeldState::HandedOver(_)))
                 .count();
             assert_eq!(active, app.active_jobs, "active jobs of {id}");
+            let spooled = held.iter().map(|held| held.spooled_bytes()).sum::<u64>();
+            assert_eq!(spooled, app.spool_bytes, "I8: the results of {id}");
+            let awake = active > 0 && app.takes_results(self.config.spool_quota_bytes);
+            assert_eq!(app.awake, awake, "whether {id} has a share");
         }
         let known = self.jobs.keys().all(|job| self.apps.contains_key(&job.app));
         assert!(known, "I8: jobs of an application that is gone");

@@ -36,6 +36,14 @@ pub(super) struct HeldJob {
 }
 
 impl HeldJob {
+    /// Bytes of its result, if that waits for acknowledgement.
+    pub(super) const fn spooled_bytes(&self) -> u64 {
+        match &self.state {
+            HeldState::Executed(spooled) => spooled.size_bytes,
+            HeldState::Fetching { .. } | HeldState::Queued | HeldState::HandedOver(_) => 0,
+        }
+    }
+
     /// Its place in a queue: class, priority, then first come, first served.
     pub(super) const fn rank(&self, job: JobId) -> Rank {
         Rank { class: Reverse(self.class), priority: Reverse(self.priority), arrival: self.arrival, job }

@@ -65,6 +65,9 @@ pub struct WorkerConfig {
     pub contact: Contact,
     /// Most jobs held, executed and unacknowledged ones too; further ones are given back (`JobFailure::Returned`).
     pub max_jobs: usize,
+    /// An application that has left this many bytes of results unacknowledged gets no further job staged until it takes some:
+    /// the jobs on devices then end, and nothing more is made for it here.
+    pub spool_quota_bytes: u64,
     /// Whether an idle device takes jobs of its siblings. On, but where its gain is measured.
     pub local_stealing: bool,
     /// How devices are shared between applications.

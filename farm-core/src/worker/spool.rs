@@ -1,5 +1,6 @@
 //! Results from execution to acknowledgement: sent on the application's current link, kept while there is none, sent
-//! again on the next one. Bytes are the driver's; the number of results is bounded by `max_jobs`.
+//! again on the next one. Bytes are the driver's; the number of results is bounded by `max_jobs`, their size by each
+//! application's quota and what is on the devices when it is reached.
 
 use super::{
     Effect, WorkerMachine,
@@ -19,12 +20,13 @@ impl WorkerMachine {
     /// An attempt ended with something for its application.
     pub(super) fn spool(&mut self, job: JobAttempt, spooled: Spooled) {
         let Some(held) = self.jobs.get_mut(&job.job) else { return };
-        self.spool_bytes += spooled.size_bytes;
+        let size_bytes = spooled.size_bytes;
         held.state = HeldState::Executed(spooled);
         let contents = std::mem::take(&mut held.contents);
         let device = held.device;
         self.leave_executor(device, job.job);
         self.release_contents(job, &contents);
+        self.spool_changed(job.job.app, |bytes| bytes + size_bytes);
         self.send_result(job.job);
     }
 

@@ -100,7 +100,12 @@ impl WorkerMachine {
         let counts_as = |app: AppId, first: &Rank| {
             if lags.had_too_much(app) { LatencyClass::Batch } else { first.class.0 }
         };
-        let firsts = || queues.iter().filter_map(|(&app, queue)| Some((app, queue.first()?)));
+        let (apps, quota_bytes) = (&self.apps, self.config.spool_quota_bytes);
+        let takes_results = |app: &AppId| apps.get(app).is_some_and(|app| app.takes_results(quota_bytes));
+        let firsts = || {
+            let queues = queues.iter().filter(|(app, _)| takes_results(app));
+            queues.filter_map(|(&app, queue)| Some((app, queue.first()?)))
+        };
         let class = firsts().map(|(app, first)| counts_as(app, first)).max()?;
         let mut candidates =
             firsts().filter(|(app, first)| counts_as(*app, first) == class).map(|(app, _)| app);

@@ -15,9 +15,9 @@ pub struct Standing {
 }
 
 impl WorkerMachine {
-    /// The applications with jobs that could be staged, are staged or run.
+    /// The applications with jobs that could be staged, are staged or run, and that take their results.
     pub fn standings(&self) -> impl Iterator<Item = Standing> {
-        self.apps.iter().filter(|(_, app)| app.active_jobs > 0).map(|(&app, _)| {
+        self.apps.iter().filter(|(_, app)| app.awake).map(|(&app, _)| {
             let mut devices = self.devices.iter().filter(|device| !device.lost);
             let backlogged = devices.all(|device| device.queues().contains_key(&app));
             Standing { app, lag: self.lags.lag(app), backlogged }

@@ -4,4 +4,5 @@
 
 mod contents;
 mod node;
+mod spool;
 mod staging;

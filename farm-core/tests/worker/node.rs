@@ -10,7 +10,7 @@ use farm_core::{
     },
     message::{
         AppToNode, Contact, CoordinatorToNode, CostNs, JobFailure, JobTicket, LatencyClass, Liveness,
-        NodeToCoordinator, PROTOCOL_VERSION, Priority,
+        NodeToCoordinator, PROTOCOL_VERSION, Priority, ResultAck,
     },
     program::Content,
     time::Instant,
@@ -45,6 +45,7 @@ impl Node {
             devices: vec![device; devices],
             contact: Contact { addresses: Vec::new(), certificate_der: Vec::new() },
             max_jobs: 1_000,
+            spool_quota_bytes: 1_000,
             local_stealing,
             share: Share::DEFAULT,
             seed: 1,
@@ -140,6 +141,17 @@ impl Node {
     pub(crate) fn done(&mut self, job: JobAttempt, device: u16) {
         let outcome = Ok((Vec::new(), ContentHash::EMPTY));
         self.ended(job, device, 10 * MILLISECOND_NS, outcome);
+    }
+
+    /// A job ends with so many bytes of result.
+    pub(crate) fn done_with(&mut self, job: JobAttempt, device: u16, bytes: u64) {
+        self.ended(job, device, 10 * MILLISECOND_NS, Ok((vec![bytes], ContentHash::EMPTY)));
+    }
+
+    /// The application has the result.
+    pub(crate) fn acknowledge(&mut self, job: JobAttempt) {
+        let acks = vec![ResultAck { job, digest: ContentHash::EMPTY }];
+        self.tell(Event::FromApp { link: LinkId(job.job.app.0), message: AppToNode::Acks(acks) });
     }
 
     pub(crate) fn cancelled(&mut self, job: JobAttempt, device: u16) {

@@ -146,6 +146,7 @@ impl WorkerHost {
                 certificate_der: Vec::new(),
             },
             max_jobs: self.max_jobs,
+            spool_quota_bytes: 1 << 30,
             share: Share::DEFAULT,
             local_stealing: true,
             seed,
