@@ -22,12 +22,14 @@ const SEEDS: [(&str, &[u64]); 4] = [
     // job poison. Of the simulator itself: 10284, 13445, 17727: jobs of applications that were away were held against
     // idle devices. 18944: a process that had ended took programs in. 6521: what a node moved off a lost device was not
     // seen by thieves. 47121, 68965, 71353, 73278: contents out of reach for two seconds failed their jobs. Of the simulator:
-    // 35007, 47627: a job that was planned anew after its end was said to be stolen too often.
+    // 35007, 47627: a job that was planned anew after its end was said to be stolen too often. 20267: before any job was
+    // completed queues were taken for so short that nothing was worth a steal. 24543: all nodes waited for a content to come to
+    // one whose application was gone.
     (
         "weather",
         &[
-            78, 165, 305, 2_376, 5_330, 6_521, 10_284, 13_445, 17_727, 18_944, 35_007, 47_121, 47_627,
-            68_965, 71_353, 73_278,
+            78, 165, 305, 2_376, 5_330, 6_521, 10_284, 13_445, 17_727, 18_944, 20_267, 24_543, 35_007,
+            47_121, 47_627, 68_965, 71_353, 73_278,
         ],
     ),
     // 17, 48, 143: an application that resumed without its memory was not told of jobs that had been executed, threw

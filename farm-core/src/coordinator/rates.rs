@@ -26,6 +26,10 @@ const MAX_RATE_STEP: f64 = 16.0;
 const FAR_OFF: f64 = 2.0;
 const CHANGED_AFTER: i8 = 4;
 
+/// What a point of score is taken to be worth before any job was completed: a device of score 1,000 has speed 1.0, as
+/// simulated devices have. Only what is weighed against other times, such as a transfer's, depends on it.
+const UNKNOWN_SCALE: f64 = 1e-3;
+
 /// Most modules with a scale of their own; beyond it the one that was asked for longest ago is forgotten.
 const MAX_MODULES: usize = 1_024;
 
@@ -98,7 +102,7 @@ impl Modules {
     /// Load per time that a point of score stands for.
     fn scale(&self, module: Module) -> f64 {
         let own = self.entries.get(&module).and_then(|entry| entry.scale.value);
-        own.or(self.overall.value).unwrap_or(1.0)
+        own.or(self.overall.value).unwrap_or(UNKNOWN_SCALE)
     }
 
     fn observe(&mut self, module: Module, sample: f64) {

@@ -165,6 +165,9 @@ impl WorkerMachine {
             None => {
                 holding.state = ContentState::Wanted;
                 self.fetch_wanted();
+                if self.contents.get(&hash).is_some_and(|holding| holding.state == ContentState::Wanted) {
+                    self.not_on_its_way(hash);
+                }
             }
         }
     }
@@ -202,6 +205,15 @@ impl WorkerMachine {
         self.tell_coordinator(NodeToCoordinator::Locate(content));
     }
 
+    /// A large content does not come from the application for now: nobody else should wait for it to arrive here. Later tries
+    /// ask nobody.
+    fn not_on_its_way(&mut self, hash: ContentHash) {
+        let large = self.contents.get(&hash).is_some_and(|holding| holding.content.size_bytes >= LARGE_BYTES);
+        if large {
+            self.tell_cache_changed(Vec::new(), vec![hash]);
+        }
+    }
+
     fn tell_cache_changed(&mut self, held: Vec<ContentHash>, gone: Vec<ContentHash>) {
         if self.session.is_registered() {
             self.tell_coordinator(NodeToCoordinator::CacheChanged { held, gone });
@@ -229,10 +241,13 @@ impl WorkerMachine {
         tracing::warn!(content = %hash, reason, "fetch failed");
         holding.state = ContentState::Wanted;
         holding.failed_tries += 1;
-        if holding.failed_tries < MAX_FETCH_TRIES {
+        let goes_on = holding.failed_tries < MAX_FETCH_TRIES;
+        self.not_on_its_way(hash);
+        if goes_on {
             self.refetch_soon(now);
             return;
         }
+        let Some(holding) = self.contents.get_mut(&hash) else { return };
         holding.failed_tries = 0;
         for job in std::mem::take(&mut holding.waiting) {
             let Some(device) =
@@ -247,17 +262,18 @@ impl WorkerMachine {
 
     /// What was on its way on a closed link is not.
     pub(super) fn link_fetches_nothing(&mut self, now: Instant, link: LinkId) {
-        let mut any = false;
-        for holding in
-            self.contents.values_mut().filter(|holding| holding.state == ContentState::Fetching(link))
+        let mut lost = Vec::new();
+        for (&hash, holding) in
+            self.contents.iter_mut().filter(|(_, holding)| holding.state == ContentState::Fetching(link))
         {
             holding.state = ContentState::Wanted;
-            any = true;
+            lost.push(hash);
         }
         // Another application with a link may have the same content.
-        if any {
+        if !lost.is_empty() {
             self.refetch_soon(now);
         }
+        lost.into_iter().for_each(|hash| self.not_on_its_way(hash));
     }
 
     /// Asks for what is wanted on the links that are there.

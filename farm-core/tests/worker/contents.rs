@@ -114,3 +114,23 @@ fn a_content_that_nobody_needs_any_more_is_not_waited_for() {
     located(&mut node, Some(peer()));
     assert_eq!(node.fetches, []);
 }
+
+#[test]
+fn nobody_waits_for_what_does_not_come_here() {
+    // The application went away before the answer, during its fetch, or does not have it.
+    let mut node = Node::new(1, true, 1);
+    node.job_with(vec![LARGE]);
+    node.tell(Event::AppLinkClosed { link: LinkId(1) });
+    located(&mut node, None);
+    assert_eq!((told_of_cache(&mut node), node.fetches.len()), (vec![gone()], 0));
+    let mut node = Node::new(1, true, 1);
+    node.job_with(vec![LARGE]);
+    located(&mut node, None);
+    node.tell(Event::AppLinkClosed { link: LinkId(1) });
+    assert_eq!(told_of_cache(&mut node), [gone()]);
+    let mut node = Node::new(1, true, 1);
+    node.job_with(vec![LARGE]);
+    located(&mut node, None);
+    failed(&mut node);
+    assert_eq!(told_of_cache(&mut node), [gone()]);
+}
