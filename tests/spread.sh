@@ -16,7 +16,10 @@ pids=""
 
 clean_up() {
     for pid in $pids; do kill -9 "$pid" 2>/dev/null || true; done
-    for host in app $(seq "$nodes"); do ip netns delete "glspread-$host" 2>/dev/null || true; done
+    for host in app $(seq "$nodes"); do
+        ip link delete "gls$host" 2>/dev/null || true
+        ip netns delete "glspread-$host" 2>/dev/null || true
+    done
     ip link delete glspread 2>/dev/null || true
     iptables -D FORWARD -i glspread -o glspread -j ACCEPT 2>/dev/null || true
     rm -rf "$work"
@@ -25,7 +28,7 @@ trap clean_up EXIT INT TERM
 
 if [ -z "$scene" ]; then
     scene=$work/scene
-    "$bin/farmctl" scene atrium "$scene" --triangles 700000 >/dev/null
+    "$bin/farmctl" scene atrium "$scene" --triangles 1400000 >/dev/null
 fi
 
 ip link add glspread type bridge
