@@ -38,6 +38,14 @@ pub enum FarmError {
         /// Its reason.
         reason: String,
     },
+    /// The farm does not let this application in, or is not the application's.
+    #[error("coordinator {address} denies: {reason}")]
+    Denied {
+        /// Who.
+        address: String,
+        /// Why.
+        reason: String,
+    },
     /// The coordinator was lost during a run and did not come back in time.
     #[error("coordinator {address} was lost and did not come back within {waited:.1?}: {reason}")]
     CoordinatorLost {
@@ -170,6 +178,7 @@ impl FarmError {
             Self::JobFailed { failure, .. } => failure.can_be_retried(),
             Self::Options { .. }
             | Self::Refused { .. }
+            | Self::Denied { .. }
             | Self::Graph(_)
             | Self::Task { .. }
             | Self::Dispatch { .. }

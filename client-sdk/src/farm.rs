@@ -76,8 +76,9 @@ impl Farm {
     }
 
     async fn register(options: FarmOptions) -> Result<Self, FarmError> {
-        let session =
-            connect_app(&options.coordinator).await.map_err(|error| connect_error(&options, error))?;
+        let session = connect_app(&options.coordinator, options.identity.as_ref())
+            .await
+            .map_err(|error| connect_error(&options, error))?;
         let (driver, inputs) = DriverHandle::new();
         let (progress, _) = watch::channel(Progress::default());
         let (stop, stop_receiver) = watch::channel(false);
@@ -187,6 +188,7 @@ fn connect_error(options: &FarmOptions, error: SessionError) -> FarmError {
     match error {
         SessionError::Address { reason, .. } => FarmError::Options { option: "coordinator", reason },
         SessionError::Refused { reason } => FarmError::Refused { address, reason },
+        SessionError::Denied { reason } => FarmError::Denied { address, reason },
         SessionError::Unreachable { reason, .. } => FarmError::Unreachable { address, reason },
         error @ (SessionError::Ended { .. } | SessionError::Malformed { .. } | SessionError::Full) => {
             FarmError::Unreachable { address, reason: error.to_string() }

@@ -96,6 +96,7 @@ pub use farm_core::{
     message::{CostNs, JobFailure, Priority, WaitReason},
     program::{Access, Buffer, Content, DispatchError, JobProgram, Kernel, ProgramError, Slicing},
 };
+pub use proto::trust::Identity;
 
 pub use crate::{
     content::TaskData,

@@ -3,6 +3,7 @@
 use std::time::Duration;
 
 use farm_core::coordinator::policy::FCFS;
+use proto::trust::Identity;
 
 use crate::error::FarmError;
 
@@ -21,6 +22,8 @@ pub struct FarmOptions {
     /// The coordinator's placement policy for this application's jobs: `fcfs`, `history` (costs of the same jobs of the
     /// application's last task, longest first), or the name of a plug-in in the coordinator's folder.
     pub policy: String,
+    /// Who the application is in a secured farm; without it, the farm has to be open.
+    pub identity: Option<Identity>,
     /// How long connecting and registering may take.
     pub connect_timeout: Duration,
     /// How long a lost coordinator is tried again before the run ends.
@@ -58,6 +61,7 @@ impl FarmOptions {
             weight: 1.0,
             global_stealing: false,
             policy: FCFS.to_owned(),
+            identity: None,
             connect_timeout: Duration::from_secs(5),
             reconnect_timeout: Duration::from_secs(30),
             patience: Duration::from_secs(60),

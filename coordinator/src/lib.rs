@@ -3,9 +3,12 @@
 //!
 //! One task owns the machine; everything else sends it messages. It never decides who runs what: the machine does.
 
+mod audit;
+mod identities;
 mod owner;
 pub mod plugins;
 pub mod policy_host;
+mod security;
 mod sessions;
 mod store;
 mod web;
@@ -14,6 +17,7 @@ use std::{
     hash::{BuildHasher as _, Hasher as _, RandomState},
     net::SocketAddr,
     path::PathBuf,
+    sync::Arc,
     time::Duration,
 };
 
@@ -22,18 +26,21 @@ use farm_core::{
     id::NodeId,
     message::Liveness,
 };
+use proto::control::Incoming;
 use thiserror::Error;
 use tokio::{
     net::TcpListener,
     sync::{oneshot, watch},
-    task::JoinHandle,
+    task::{JoinHandle, JoinSet},
 };
 
+pub use self::security::{AUTHORITY_FILE, initialise};
 use self::{
     owner::{Owner, OwnerHandle},
     plugins::{PluginOptions, Plugins},
+    security::{Gate, Security, TrustService},
     sessions::Sessions,
-    store::{ControlStore, FileStore, MemoryStore},
+    store::{Store, epoch_by_the_clock},
 };
 
 /// How long `shutdown` waits for connections to close by themselves before it cuts them.
@@ -46,8 +53,10 @@ pub struct CoordinatorOptions {
     pub listen: SocketAddr,
     /// HTTP address (status page, metrics, health); port 0 lets the system choose.
     pub http: SocketAddr,
-    /// Where the epoch is kept; `None`: nowhere, the epoch is the time of the start.
+    /// Where the epoch and members are kept; `None`: nowhere, the epoch is the time of the start.
     pub state: Option<PathBuf>,
+    /// Whether members of the farm alone are let in, by the authority in the state directory.
+    pub secured: bool,
     /// Timings told to nodes and applications.
     pub liveness: Liveness,
     /// How long a vanished application keeps its jobs, in milliseconds.
@@ -62,6 +71,7 @@ impl Default for CoordinatorOptions {
             listen: SocketAddr::from(([127, 0, 0, 1], 7700)),
             http: SocketAddr::from(([127, 0, 0, 1], 7701)),
             state: None,
+            secured: false,
             liveness: Liveness::default(),
             app_lease_ms: 30_000,
             plugins: None,
@@ -102,6 +112,9 @@ pub enum StartError {
         /// Why not.
         reason: String,
     },
+    /// The farm's authority or identities cannot be used.
+    #[error("{0}")]
+    Trust(String),
     /// The plug-in folder, a plug-in or the plug-ins' host cannot be used.
     #[error("plug-in {path}: {reason}")]
     Plugin {
@@ -125,7 +138,9 @@ pub struct CoordinatorHandle {
     /// Owner, gRPC server, HTTP server.
     tasks: [JoinHandle<()>; 3],
     /// Keeps the state directory locked.
-    _store: Box<dyn ControlStore>,
+    _store: Option<Store>,
+    /// Renews the coordinator's certificate; ends with the handle.
+    renewal: JoinSet<()>,
 }
 
 impl CoordinatorHandle {
@@ -158,7 +173,7 @@ impl CoordinatorHandle {
 
     /// Closes every session and waits (at most two seconds) until all is down.
     pub async fn shutdown(self) {
-        let Self { stop_owner, stop_servers, tasks, .. } = self;
+        let Self { stop_owner, stop_servers, tasks, mut renewal, .. } = self;
         drop(stop_owner);
         drop(stop_servers);
         for mut task in tasks {
@@ -167,6 +182,8 @@ impl CoordinatorHandle {
                 task.abort();
             }
         }
+        // It holds the state directory, too.
+        renewal.shutdown().await;
     }
 }
 
@@ -182,11 +199,16 @@ pub async fn start(options: CoordinatorOptions) -> Result<CoordinatorHandle, Sta
         None => Plugins::none(),
     };
     // After the addresses: a second coordinator on them is refused without counting as a life.
-    let mut store: Box<dyn ControlStore> = match &options.state {
-        Some(directory) => Box::new(FileStore::open(directory)?),
-        None => Box::new(MemoryStore),
+    let mut store = options.state.as_deref().map(Store::open).transpose()?;
+    let epoch = store.as_ref().map_or_else(|| Ok(epoch_by_the_clock()), Store::begin_epoch)?;
+    let gate = match (options.secured, &options.state) {
+        (false, _) => Gate::Open,
+        (true, Some(directory)) => {
+            let store = store.take().ok_or_else(|| StartError::Trust("no control store".to_owned()))?;
+            Gate::Members(Security::open(directory, store)?)
+        }
+        (true, None) => return Err(StartError::Trust("a secured farm needs a state directory".to_owned())),
     };
-    let epoch = store.begin_epoch()?;
     let config = CoordinatorConfig {
         liveness: options.liveness,
         app_lease_ms: options.app_lease_ms,
@@ -197,13 +219,31 @@ pub async fn start(options: CoordinatorOptions) -> Result<CoordinatorHandle, Sta
     let (owner, commands) = OwnerHandle::new();
     let (stop_owner, owner_stops) = oneshot::channel();
     let (stop_servers, servers_stop) = watch::channel(());
-    let owner_task =
-        tokio::spawn(Owner::new(CoordinatorMachine::new(config), plugins).run(commands, owner_stops));
-    let grpc_task = tokio::spawn(serve_grpc(grpc, Sessions::new(owner.clone()), servers_stop.clone()));
+    let incoming = match &gate {
+        Gate::Open => Incoming::of(grpc),
+        Gate::Members(security) => Incoming::secured(grpc, security.identity())
+            .map_err(|error| StartError::Trust(error.to_string()))?,
+    };
+    let mut renewal = JoinSet::new();
+    if let Gate::Members(security) = &gate {
+        renewal.spawn(Arc::clone(security).stay_valid());
+    }
+    let machine = CoordinatorMachine::new(config);
+    let owner_task = tokio::spawn(Owner::new(machine, plugins, gate.clone()).run(commands, owner_stops));
+    let grpc_task = tokio::spawn(serve_grpc(incoming, owner.clone(), gate, servers_stop.clone()));
     let http_task = tokio::spawn(serve_http(http, owner.clone(), servers_stop));
-    tracing::info!(%epoch, grpc = %grpc_addr, http = %http_addr, "coordinator started");
+    tracing::info!(%epoch, grpc = %grpc_addr, http = %http_addr, secured = options.secured, "coordinator started");
     let tasks = [owner_task, grpc_task, http_task];
-    Ok(CoordinatorHandle { owner, grpc_addr, http_addr, stop_owner, stop_servers, tasks, _store: store })
+    Ok(CoordinatorHandle {
+        owner,
+        grpc_addr,
+        http_addr,
+        stop_owner,
+        stop_servers,
+        tasks,
+        _store: store,
+        renewal,
+    })
 }
 
 async fn listen(what: &'static str, address: SocketAddr) -> Result<(TcpListener, SocketAddr), StartError> {
@@ -213,13 +253,15 @@ async fn listen(what: &'static str, address: SocketAddr) -> Result<(TcpListener,
     Ok((listener, local))
 }
 
-async fn serve_grpc(listener: TcpListener, sessions: Sessions, mut stop: watch::Receiver<()>) {
-    use proto::control::{Incoming, admin_server, apps_server, nodes_server, server};
+async fn serve_grpc(incoming: Incoming, owner: OwnerHandle, gate: Gate, mut stop: watch::Receiver<()>) {
+    use proto::control::{admin_server, apps_server, nodes_server, server, trust_server};
+    let sessions = Sessions::new(owner, gate.clone());
     let served = server()
         .add_service(apps_server(sessions.clone()))
         .add_service(nodes_server(sessions.clone()))
         .add_service(admin_server(sessions))
-        .serve_with_incoming_shutdown(Incoming::of(listener), async move {
+        .add_service(trust_server(TrustService::new(gate)))
+        .serve_with_incoming_shutdown(incoming, async move {
             // The error is the signal: the handle is gone.
             let _ = stop.changed().await;
         })

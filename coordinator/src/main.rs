@@ -51,12 +51,13 @@ async fn run(options: CoordinatorOptions) -> anyhow::Result<()> {
     // Before anything is started: a signal during the start is not lost.
     let mut interrupt = signal(SignalKind::interrupt()).context("cannot listen for SIGINT")?;
     let mut terminate = signal(SignalKind::terminate()).context("cannot listen for SIGTERM")?;
-    for address in [options.listen, options.http] {
+    let in_plain_text = if options.secured { vec![options.http] } else { vec![options.listen, options.http] };
+    for address in in_plain_text {
         if !address.ip().is_loopback() {
             tracing::warn!(
                 %address,
                 "listening beyond this machine WITHOUT authentication or encryption: whoever reaches this address can use \
-                 and disturb the farm; do so only on a network you trust"
+                 or watch the farm; do so only on a network you trust, or secure the farm with `farmctl init`"
             );
         }
     }

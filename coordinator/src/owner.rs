@@ -13,13 +13,18 @@ use farm_core::{
     message::{AppToCoordinator, CoordinatorToApp, CoordinatorToNode, NodeToCoordinator},
     time::Instant,
 };
+use proto::trust::Principal;
 use tokio::{
     sync::{mpsc, oneshot},
     time,
 };
 use tonic::Status;
 
-use crate::plugins::{Answered, Plugins};
+use crate::{
+    identities::Identities,
+    plugins::{Answered, Plugins},
+    security::Gate,
+};
 
 /// Commands that wait for the owner; a full queue holds the peers' messages back in their connections.
 pub(crate) const QUEUED_COMMANDS: usize = 1_024;
@@ -51,12 +56,22 @@ pub(crate) enum Command {
 /// The owner's end of one connection. Dropping it ends the session after what is queued.
 pub(crate) struct Peer<M> {
     /// To the peer.
-    pub(crate) outbound: mpsc::Sender<Result<M, Status>>,
+    outbound: mpsc::Sender<Result<M, Status>>,
     /// Tells the session's reader to stop; dropped with the peer.
-    pub(crate) _alive: oneshot::Sender<()>,
+    _alive: oneshot::Sender<()>,
+    /// Who it is, in a secured farm.
+    member: Option<Principal>,
 }
 
 impl<M> Peer<M> {
+    pub(crate) const fn new(
+        outbound: mpsc::Sender<Result<M, Status>>,
+        alive: oneshot::Sender<()>,
+        member: Option<Principal>,
+    ) -> Self {
+        Self { outbound, _alive: alive, member }
+    }
+
     /// False if the peer does not read or is gone.
     fn tell(&self, message: M) -> bool {
         self.outbound.try_send(Ok(message)).is_ok()
@@ -71,11 +86,19 @@ pub(crate) struct Owner {
     origin: time::Instant,
     apps: HashMap<LinkId, Peer<CoordinatorToApp>>,
     nodes: HashMap<LinkId, Peer<CoordinatorToNode>>,
+    identities: Identities,
 }
 
 impl Owner {
-    pub(crate) fn new(machine: CoordinatorMachine, plugins: Plugins) -> Self {
-        Self { machine, plugins, origin: time::Instant::now(), apps: HashMap::new(), nodes: HashMap::new() }
+    pub(crate) fn new(machine: CoordinatorMachine, plugins: Plugins, gate: Gate) -> Self {
+        Self {
+            machine,
+            plugins,
+            origin: time::Instant::now(),
+            apps: HashMap::new(),
+            nodes: HashMap::new(),
+            identities: Identities::new(gate),
+        }
     }
 
     /// Runs until `stop` is told or dropped.
@@ -122,13 +145,17 @@ impl Owner {
             }
             // What a peer said before its connection was closed here has no one to answer to.
             Command::FromApp(link, message) => {
-                if self.apps.contains_key(&link) {
-                    self.machine.handle(now, Event::FromApp { link, message });
+                let Some(peer) = self.apps.get(&link) else { return };
+                match self.identities.check_app(peer.member.as_ref(), &message) {
+                    Ok(()) => self.machine.handle(now, Event::FromApp { link, message }),
+                    Err(reason) => self.refuse(now, link, reason),
                 }
             }
             Command::FromNode(link, message) => {
-                if self.nodes.contains_key(&link) {
-                    self.machine.handle(now, Event::FromNode { link, message });
+                let Some(peer) = self.nodes.get(&link) else { return };
+                match self.identities.check_node(peer.member.as_ref(), &message) {
+                    Ok(()) => self.machine.handle(now, Event::FromNode { link, message }),
+                    Err(reason) => self.refuse(now, link, reason),
                 }
             }
             Command::Closed(link) => {
@@ -153,9 +180,7 @@ impl Owner {
     fn carry_out(&mut self, now: Instant) {
         while let Some(effect) = self.machine.poll_effect() {
             let (link, told) = match effect {
-                Effect::ToApp { link, message } => {
-                    (link, self.apps.get(&link).is_none_or(|peer| peer.tell(message)))
-                }
+                Effect::ToApp { link, message } => (link, self.tell_app(link, message)),
                 Effect::ToNode { link, message } => {
                     (link, self.nodes.get(&link).is_none_or(|peer| peer.tell(message)))
                 }
@@ -178,8 +203,31 @@ impl Owner {
         }
     }
 
+    /// Tells an application something, and before it, where it is due, what to show to nodes. False if it does not read.
+    fn tell_app(&mut self, link: LinkId, message: CoordinatorToApp) -> bool {
+        let Some(peer) = self.apps.get(&link) else { return true };
+        let capability =
+            peer.member.as_ref().and_then(|member| self.identities.capability(link, member, &message));
+        capability.is_none_or(|bytes| peer.tell(CoordinatorToApp::Capability(bytes))) && peer.tell(message)
+    }
+
+    /// Ends the connection of a member who says what it may not.
+    fn refuse(&mut self, now: Instant, link: LinkId, reason: String) {
+        let status = Status::permission_denied(reason);
+        // A peer that does not read its answers does not learn why.
+        if let Some(peer) = self.apps.get(&link) {
+            let _ = peer.outbound.try_send(Err(status));
+        } else if let Some(peer) = self.nodes.get(&link) {
+            let _ = peer.outbound.try_send(Err(status));
+        }
+        if self.forget(link) {
+            self.machine.handle(now, Event::LinkClosed { link });
+        }
+    }
+
     /// Ends a connection; false if it had ended before.
     fn forget(&mut self, link: LinkId) -> bool {
+        self.identities.forget(link);
         self.apps.remove(&link).is_some() || self.nodes.remove(&link).is_some()
     }
 }
@@ -248,7 +296,7 @@ mod tests {
         let (owner, commands) = OwnerHandle::new();
         let (_stop, stopped) = oneshot::channel();
         let machine = CoordinatorMachine::new(CoordinatorConfig::new(Epoch(1), 7));
-        tokio::spawn(Owner::new(machine, Plugins::none()).run(commands, stopped));
+        tokio::spawn(Owner::new(machine, Plugins::none(), Gate::Open).run(commands, stopped));
         let open = |link, capacity| {
             let (outbound, outgoing) = mpsc::channel(capacity);
             let (alive, ended) = oneshot::channel();
@@ -261,7 +309,7 @@ mod tests {
                 resume: None,
             };
             let said = [
-                Command::AppOpened(link, Peer { outbound, _alive: alive }),
+                Command::AppOpened(link, Peer::new(outbound, alive, None)),
                 Command::FromApp(link, AppToCoordinator::Hello(hello)),
                 Command::FromApp(link, AppToCoordinator::Heartbeat { sequence: 1 }),
             ];
@@ -300,7 +348,7 @@ mod tests {
         let (owner, commands) = OwnerHandle::new();
         let (stop, stopped) = oneshot::channel();
         let machine = CoordinatorMachine::new(CoordinatorConfig::new(Epoch(1), 7));
-        let task = tokio::spawn(Owner::new(machine, Plugins::none()).run(commands, stopped));
+        let task = tokio::spawn(Owner::new(machine, Plugins::none(), Gate::Open).run(commands, stopped));
         assert_eq!(owner.drain(NodeId(1)).await, Some(false), "no such node");
         drop(stop);
         task.await.unwrap();

@@ -22,7 +22,10 @@ use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc, oneshot};
 use tokio_stream::{Stream, StreamExt as _, wrappers::ReceiverStream};
 use tonic::{Request, Response, Status, Streaming};
 
-use crate::owner::{Command, OwnerHandle, Peer, QUEUED_MESSAGES};
+use crate::{
+    owner::{Command, OwnerHandle, Peer, QUEUED_MESSAGES},
+    security::{Action, Gate},
+};
 
 /// Sessions of applications and nodes together, at most; further ones are refused.
 const MAX_SESSIONS: usize = 4_096;
@@ -32,24 +35,26 @@ const FIRST_MESSAGE_TIMEOUT: Duration = Duration::from_secs(10);
 /// Segments in one part of a timeline, about half a megabyte: far below the message cap.
 const PART_SEGMENTS: usize = 8_192;
 
-/// All three services; cloneable.
+/// The services of applications, nodes and operators; cloneable.
 #[derive(Clone, Debug)]
 pub(crate) struct Sessions {
     owner: OwnerHandle,
+    gate: Gate,
     next_link: Arc<AtomicU64>,
     slots: Arc<Semaphore>,
 }
 
 impl Sessions {
-    pub(crate) fn new(owner: OwnerHandle) -> Self {
+    pub(crate) fn new(owner: OwnerHandle, gate: Gate) -> Self {
         let slots = Arc::new(Semaphore::new(MAX_SESSIONS));
-        Self { owner, next_link: Arc::new(AtomicU64::new(1)), slots }
+        Self { owner, gate, next_link: Arc::new(AtomicU64::new(1)), slots }
     }
 
     /// Opens a session: `opened`, `said` wrap what the owner is told.
     async fn open<In, Out, Wire>(
         &self,
-        messages: Streaming<Wire>,
+        request: Request<Streaming<Wire>>,
+        action: Action,
         opened: fn(LinkId, Peer<Out>) -> Command,
         said: fn(LinkId, In) -> Command,
     ) -> Result<ReceiverStream<Result<Out, Status>>, Status>
@@ -58,13 +63,15 @@ impl Sessions {
         Out: Send + 'static,
         Wire: Send + 'static,
     {
+        let member = self.gate.admit(request.extensions(), action)?.map(|member| member.principal);
+        let messages = request.into_inner();
         let Ok(slot) = Arc::clone(&self.slots).try_acquire_owned() else {
             return Err(Status::resource_exhausted(format!("{MAX_SESSIONS} sessions are open already")));
         };
         let link = LinkId(self.next_link.fetch_add(1, Ordering::Relaxed));
         let (outbound, outgoing) = mpsc::channel(QUEUED_MESSAGES);
         let (alive, ended) = oneshot::channel();
-        if !self.owner.send(opened(link, Peer { outbound: outbound.clone(), _alive: alive })).await {
+        if !self.owner.send(opened(link, Peer::new(outbound.clone(), alive, member))).await {
             return Err(Status::unavailable("the coordinator stops"));
         }
         let reader = Reader { link, owner: self.owner.clone(), outbound, ended, _slot: slot };
@@ -139,9 +146,9 @@ impl Apps for Sessions {
         &self,
         request: Request<Streaming<v1::AppToCoordinator>>,
     ) -> Result<Response<Self::SessionStream>, Status> {
-        let messages = request.into_inner();
+        let (opened, said) = (Command::AppOpened, Command::FromApp);
         let answers = self
-            .open::<AppToCoordinator, CoordinatorToApp, _>(messages, Command::AppOpened, Command::FromApp)
+            .open::<AppToCoordinator, CoordinatorToApp, _>(request, Action::Compute, opened, said)
             .await?;
         Ok(Response::new(Box::pin(answers.map(|answer| answer.map(Into::into)))))
     }
@@ -155,9 +162,9 @@ impl Nodes for Sessions {
         &self,
         request: Request<Streaming<v1::NodeToCoordinator>>,
     ) -> Result<Response<Self::SessionStream>, Status> {
-        let messages = request.into_inner();
+        let (opened, said) = (Command::NodeOpened, Command::FromNode);
         let answers = self
-            .open::<NodeToCoordinator, CoordinatorToNode, _>(messages, Command::NodeOpened, Command::FromNode)
+            .open::<NodeToCoordinator, CoordinatorToNode, _>(request, Action::Serve, opened, said)
             .await?;
         Ok(Response::new(Box::pin(answers.map(|answer| answer.map(Into::into)))))
     }
@@ -167,15 +174,20 @@ impl Nodes for Sessions {
 impl Admin for Sessions {
     type TimelineStream = Answers<v1::TimelinePart>;
 
-    async fn status(&self, _request: Request<v1::StatusRequest>) -> Result<Response<v1::FarmStatus>, Status> {
+    async fn status(&self, request: Request<v1::StatusRequest>) -> Result<Response<v1::FarmStatus>, Status> {
+        self.gate.admit(request.extensions(), Action::Look)?;
         let status = self.owner.status().await.ok_or_else(stopping)?;
         Ok(Response::new(status.into()))
     }
 
     async fn drain(&self, request: Request<v1::DrainRequest>) -> Result<Response<v1::DrainResponse>, Status> {
+        let operator = self.gate.admit(request.extensions(), Action::Operate)?;
         let node = NodeId(request.into_inner().node);
         match self.owner.drain(node).await.ok_or_else(stopping)? {
-            true => Ok(Response::new(v1::DrainResponse {})),
+            true => {
+                self.gate.done("drain", operator.as_ref(), serde_json::json!({ "node": node.0 }));
+                Ok(Response::new(v1::DrainResponse {}))
+            }
             false => Err(Status::not_found(format!("{node} is not registered"))),
         }
     }
@@ -184,6 +196,7 @@ impl Admin for Sessions {
         &self,
         request: Request<v1::TimelineRequest>,
     ) -> Result<Response<Self::TimelineStream>, Status> {
+        self.gate.admit(request.extensions(), Action::Look)?;
         let timeline = self.owner.timeline(request.into_inner().into()).await.ok_or_else(stopping)?;
         Ok(Response::new(Box::pin(tokio_stream::iter(timeline_parts(timeline)).map(Ok))))
     }

@@ -8,7 +8,7 @@ use std::{
 
 use anyhow::{Context as _, bail, ensure};
 use clap::{Parser, Subcommand, ValueEnum};
-use coordinator::{CoordinatorOptions, plugins::PluginOptions};
+use coordinator::{AUTHORITY_FILE, CoordinatorOptions, plugins::PluginOptions};
 use farm_core::message::Liveness;
 use serde::Deserialize;
 
@@ -34,13 +34,14 @@ pub(crate) struct Arguments {
     /// Address of status page, metrics and health; port 0 lets the system choose [default: 127.0.0.1:7701].
     #[arg(long, value_name = "HOST:PORT", env = "GLEANER_HTTP")]
     http: Option<String>,
-    /// Directory for what must outlive this process; without it a restart is known by its time alone.
+    /// Directory for what must outlive this process; without it a restart is known by its time alone. One that `farmctl init`
+    /// has secured lets members of the farm alone in.
     #[arg(long, value_name = "DIR", env = "GLEANER_STATE")]
     state: Option<PathBuf>,
     /// How soon silence counts [default: default].
     #[arg(long, value_enum, env = "GLEANER_LIVENESS")]
     liveness: Option<Profile>,
-    /// Say that plain text is meant: refuses to listen on anything but loopback.
+    /// Let everyone in, in plain text, whatever the state directory says: refuses to listen on anything but loopback.
     #[arg(
         long,
         env = "GLEANER_INSECURE",
@@ -118,7 +119,9 @@ pub(crate) fn options(arguments: Arguments) -> anyhow::Result<CoordinatorOptions
     let defaults = CoordinatorOptions::default();
     let listen = address("listen", arguments.listen.or(file.listen), defaults.listen)?;
     let http = address("http", arguments.http.or(file.http), defaults.http)?;
-    if arguments.insecure.or(file.insecure).unwrap_or(false) {
+    let state = arguments.state.or(file.state);
+    let insecure = arguments.insecure.or(file.insecure).unwrap_or(false);
+    if insecure {
         for (name, address) in [("listen", listen), ("http", http)] {
             ensure!(
                 address.ip().is_loopback(),
@@ -131,7 +134,8 @@ pub(crate) fn options(arguments: Arguments) -> anyhow::Result<CoordinatorOptions
     Ok(CoordinatorOptions {
         listen,
         http,
-        state: arguments.state.or(file.state),
+        secured: !insecure && state.as_ref().is_some_and(|state| state.join(AUTHORITY_FILE).exists()),
+        state,
         liveness: liveness(arguments.liveness, &file.liveness)?,
         app_lease_ms: file.app_lease_ms.unwrap_or(defaults.app_lease_ms),
         plugins: plugins.map(hosted_here).transpose()?,
@@ -226,6 +230,16 @@ mod tests {
         assert_eq!(overruled.http.to_string(), "127.0.0.1:2");
         assert_eq!(overruled.state, Some(PathBuf::from("/b")));
         assert_eq!(overruled.liveness, Liveness::default());
+    }
+
+    #[test]
+    fn a_secured_state_directory_is_enough_and_insecure_overrules_it() {
+        let state = tempfile::tempdir().unwrap();
+        let path = state.path().to_str().unwrap();
+        assert!(!parse(&["--state", path], None).unwrap().secured, "nobody has secured it");
+        fs::write(state.path().join(AUTHORITY_FILE), "").unwrap();
+        assert!(parse(&["--state", path], None).unwrap().secured);
+        assert!(!parse(&["--state", path, "--insecure"], None).unwrap().secured);
     }
 
     #[test]

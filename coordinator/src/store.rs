@@ -1,102 +1,328 @@
-//! What the coordinator keeps over its own death: today the epoch alone. Plans, load and fairness are rebuilt from
-//! re-registration and never stored.
+//! What the coordinator keeps over its own death: its epoch, and, in a secured farm, who is a member and who may become one.
+//! Plans, load and fairness are rebuilt from re-registration and never stored.
+//!
+//! A redb database: what a method has returned is on disk, and after a crash the store is what was committed last.
 
 use std::{
-    fmt::Debug,
-    fs::{self, File, TryLockError},
-    io::{self, Write as _},
+    fs, io,
     path::{Path, PathBuf},
     time::SystemTime,
 };
 
 use farm_core::id::Epoch;
+use proto::trust::{Member, Membership, Principal, Role, TrustError};
+use redb::{
+    Database, DatabaseError, ReadableDatabase as _, ReadableTable as _, ReadableTableMetadata as _,
+    TableDefinition,
+};
+use serde::{Deserialize, Serialize};
+use thiserror::Error;
 
 use crate::StartError;
 
-/// The file that holds the last epoch begun, as a decimal number.
+/// The database in the state directory.
+const FILE: &str = "control.redb";
+/// What it keeps in memory, in bytes: it is read at joins and new sessions.
+const CACHE_BYTES: usize = 1 << 20;
+/// Where versions before the database kept the epoch.
 const EPOCH_FILE: &str = "epoch";
-/// Where the next one is written before it takes the file's place.
-const EPOCH_DRAFT: &str = "epoch.new";
-/// Held by the coordinator that uses the directory.
-const LOCK_FILE: &str = "lock";
 /// From 1970-01-01 to 2026-01-01: 56 years, 14 of them leap years.
 const SECONDS_1970_TO_2026: u64 = (56 * 365 + 14) * 86_400;
-/// Longest epoch file that is believed, in bytes: a u32 has ten digits.
-const MAX_EPOCH_BYTES: u64 = 16;
+/// Most tokens that can be used at a time.
+const MAX_TOKENS: u64 = 10_000;
+/// Most members.
+const MAX_MEMBERS: u64 = 100_000;
 
-/// Durable state of a coordinator.
-pub(crate) trait ControlStore: Debug + Send {
-    /// Begins a new life: larger than every earlier one, and durable when this returns.
-    fn begin_epoch(&mut self) -> Result<Epoch, StartError>;
+/// Numbers: the epoch begun last, and the last token's.
+const NUMBERS: TableDefinition<'_, &str, u64> = TableDefinition::new("numbers");
+const EPOCH: &str = "epoch";
+const LAST_TOKEN: &str = "last-token";
+/// Tokens as JSON, by the blake3 of their secrets.
+const TOKENS: TableDefinition<'_, &[u8], &str> = TableDefinition::new("tokens");
+/// The blake3 of members' public keys, by their URIs.
+const MEMBERS: TableDefinition<'_, &str, &[u8]> = TableDefinition::new("members");
+
+/// A join token, without its secret.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub(crate) struct Token {
+    /// Its number.
+    pub(crate) id: u64,
+    /// What who joins becomes.
+    pub(crate) role: String,
+    /// The name that who joins gets; empty: any that nobody has.
+    pub(crate) name: String,
+    /// Until when it can be used, in seconds since 1970.
+    pub(crate) expires_s: u64,
+    /// How often still.
+    pub(crate) uses_left: u32,
+    /// Who made it.
+    pub(crate) maker: String,
 }
 
-/// No state: lives are told apart by the wall clock, so that ids of an earlier life on the same address are never given out
-/// again. Two starts within one second, or a clock set back between them, are what `FileStore` is for.
-#[derive(Debug)]
-pub(crate) struct MemoryStore;
+/// The store did not do what it was asked for.
+#[derive(Debug, Error)]
+pub(crate) enum StoreError {
+    /// The caller may not have that.
+    #[error("{0}")]
+    Denied(String),
+    /// The disk, or the database.
+    #[error("the control store: {0}")]
+    Broken(String),
+}
 
-impl ControlStore for MemoryStore {
-    fn begin_epoch(&mut self) -> Result<Epoch, StartError> {
-        let since_1970 = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
-        let seconds = since_1970.as_secs().saturating_sub(SECONDS_1970_TO_2026).max(1);
-        // Full in the year 2162.
-        Ok(Epoch(u32::try_from(seconds).unwrap_or(u32::MAX)))
+impl From<TrustError> for StoreError {
+    fn from(error: TrustError) -> Self {
+        Self::Denied(error.to_string())
     }
+}
+
+/// The database's own errors, which are many.
+fn broken(error: impl Into<redb::Error>) -> StoreError {
+    StoreError::Broken(error.into().to_string())
+}
+
+/// Lives of a coordinator without a state directory are told apart by the wall clock, so that ids of an earlier life on the same
+/// address are never given out again. Two starts within one second, or a clock set back between them, are what [`Store`] is for.
+pub(crate) fn epoch_by_the_clock() -> Epoch {
+    let since_1970 = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
+    let seconds = since_1970.as_secs().saturating_sub(SECONDS_1970_TO_2026).max(1);
+    // Full in the year 2162.
+    Epoch(u32::try_from(seconds).unwrap_or(u32::MAX))
 }
 
 /// State in a directory of its own, locked for as long as this lives.
 #[derive(Debug)]
-pub(crate) struct FileStore {
-    directory: PathBuf,
-    _lock: File,
+pub(crate) struct Store {
+    path: PathBuf,
+    database: Database,
 }
 
-impl FileStore {
+impl Store {
     /// Makes the directory if it is not there; refuses one that another coordinator uses.
     pub(crate) fn open(directory: &Path) -> Result<Self, StartError> {
         fs::create_dir_all(directory).map_err(|error| fault(directory, &error))?;
-        let path = directory.join(LOCK_FILE);
-        let lock = File::create(&path).map_err(|error| fault(&path, &error))?;
-        match lock.try_lock() {
-            Ok(()) => Ok(Self { directory: directory.to_owned(), _lock: lock }),
-            Err(TryLockError::WouldBlock) => Err(fault(directory, &"another coordinator uses it")),
-            Err(TryLockError::Error(error)) => Err(fault(&path, &error)),
-        }
+        let path = directory.join(FILE);
+        let database =
+            Database::builder().set_cache_size(CACHE_BYTES).create(&path).map_err(|error| match error {
+                DatabaseError::DatabaseAlreadyOpen => fault(directory, &"another coordinator uses it"),
+                error => fault(&path, &error),
+            })?;
+        let store = Self { path, database };
+        store.begin(directory)?;
+        Ok(store)
     }
 
-    fn last_epoch(&self) -> Result<u32, StartError> {
-        let path = self.directory.join(EPOCH_FILE);
-        let length = match fs::metadata(&path) {
-            Ok(metadata) => metadata.len(),
-            Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(0),
-            Err(error) => return Err(fault(&path, &error)),
+    /// Makes the tables, and takes over the epoch of an earlier version.
+    fn begin(&self, directory: &Path) -> Result<(), StartError> {
+        let earlier = earlier_epoch(directory)?;
+        let write = || {
+            let transaction = self.database.begin_write().map_err(broken)?;
+            {
+                let mut numbers = transaction.open_table(NUMBERS).map_err(broken)?;
+                transaction.open_table(TOKENS).map_err(broken)?;
+                transaction.open_table(MEMBERS).map_err(broken)?;
+                let known = numbers.get(EPOCH).map_err(broken)?.is_some();
+                if let Some(earlier) = earlier.filter(|_| !known) {
+                    numbers.insert(EPOCH, u64::from(earlier)).map_err(broken)?;
+                }
+            }
+            transaction.commit().map_err(broken)
         };
-        // Starting over at epoch 1 would let old attempts win over new ones: a file that makes no sense is an error.
-        let garbled = || fault(&path, &"does not hold an epoch; restore it, or remove it if no worker runs");
-        if length > MAX_EPOCH_BYTES {
-            return Err(garbled());
-        }
-        let text = fs::read_to_string(&path).map_err(|error| fault(&path, &error))?;
-        text.trim_end().parse().map_err(|_| garbled())
+        write().map_err(|error| fault(&self.path, &error))
     }
 
-    /// Draft, fsync, rename, fsync of the directory: after a power cut either the old number or the new one is there.
-    fn write_epoch(&self, epoch: u32) -> io::Result<()> {
-        let draft = self.directory.join(EPOCH_DRAFT);
-        let mut file = File::create(&draft)?;
-        writeln!(file, "{epoch}")?;
-        file.sync_all()?;
-        fs::rename(&draft, self.directory.join(EPOCH_FILE))?;
-        File::open(&self.directory)?.sync_all()
+    /// Begins a new life: larger than every earlier one, and durable when this returns.
+    pub(crate) fn begin_epoch(&self) -> Result<Epoch, StartError> {
+        let next = self.count(EPOCH).map_err(|error| fault(&self.path, &error))?;
+        u32::try_from(next).map(Epoch).map_err(|_| fault(&self.path, &"all epochs are used up"))
+    }
+
+    /// The next of one of the numbers, from 1.
+    fn count(&self, what: &str) -> Result<u64, StoreError> {
+        let transaction = self.database.begin_write().map_err(broken)?;
+        let next = {
+            let mut numbers = transaction.open_table(NUMBERS).map_err(broken)?;
+            let last = numbers.get(what).map_err(broken)?.map_or(0, |last| last.value());
+            let next = last.saturating_add(1);
+            numbers.insert(what, next).map_err(broken)?;
+            next
+        };
+        transaction.commit().map_err(broken)?;
+        Ok(next)
+    }
+
+    /// Keeps a token under a number of its own, which it gives; forgets those that are over.
+    pub(crate) fn add_token(&self, secret: &[u8], token: Token, now_s: u64) -> Result<u64, StoreError> {
+        let id = self.count(LAST_TOKEN)?;
+        let transaction = self.database.begin_write().map_err(broken)?;
+        {
+            let mut tokens = transaction.open_table(TOKENS).map_err(broken)?;
+            tokens
+                .retain(|_, text| parse(text).is_ok_and(|token| token.expires_s > now_s))
+                .map_err(broken)?;
+            if tokens.len().map_err(broken)? >= MAX_TOKENS {
+                return Err(StoreError::Denied(format!(
+                    "{MAX_TOKENS} tokens are there already; take some back"
+                )));
+            }
+            let text = text_of(&Token { id, ..token })?;
+            tokens.insert(digest(secret).as_slice(), text.as_str()).map_err(broken)?;
+        }
+        transaction.commit().map_err(broken)?;
+        Ok(id)
+    }
+
+    /// The tokens that can be used still, by number.
+    pub(crate) fn tokens(&self, now_s: u64) -> Result<Vec<Token>, StoreError> {
+        let transaction = self.database.begin_read().map_err(broken)?;
+        let table = transaction.open_table(TOKENS).map_err(broken)?;
+        let mut tokens = Vec::new();
+        for entry in table.iter().map_err(broken)? {
+            let (_, text) = entry.map_err(broken)?;
+            tokens.push(parse(text.value())?);
+        }
+        tokens.retain(|token: &Token| token.expires_s > now_s);
+        tokens.sort_unstable_by_key(|token| token.id);
+        Ok(tokens)
+    }
+
+    /// Takes a token back; whether it was there.
+    pub(crate) fn remove_token(&self, id: u64) -> Result<bool, StoreError> {
+        let transaction = self.database.begin_write().map_err(broken)?;
+        let mut removed = false;
+        {
+            let mut tokens = transaction.open_table(TOKENS).map_err(broken)?;
+            tokens
+                .retain(|_, text| {
+                    let this = parse(text).is_ok_and(|token| token.id == id);
+                    removed |= this;
+                    !this
+                })
+                .map_err(broken)?;
+        }
+        transaction.commit().map_err(broken)?;
+        Ok(removed)
+    }
+
+    /// Uses a token once: `issue` makes the membership for role and name, and only if it does is the token used. A name that
+    /// somebody has is given to another key only by a token for that name.
+    pub(crate) fn join(
+        &self,
+        secret: &[u8],
+        wanted: &str,
+        now_s: u64,
+        issue: impl FnOnce(Role, &str) -> Result<Membership, TrustError>,
+    ) -> Result<Membership, StoreError> {
+        // One answer for what never was, is over, was used up or was taken back: strangers learn nothing.
+        let unknown = || StoreError::Denied("this token cannot be used (any more)".to_owned());
+        let transaction = self.database.begin_write().map_err(broken)?;
+        let membership = {
+            let mut tokens = transaction.open_table(TOKENS).map_err(broken)?;
+            let key = digest(secret);
+            let token =
+                tokens.get(key.as_slice()).map_err(broken)?.map(|text| parse(text.value())).transpose()?;
+            let mut token = token.filter(|token| token.expires_s > now_s).ok_or_else(unknown)?;
+            let name = match (token.name.as_str(), wanted) {
+                ("", "") => return Err(StoreError::Denied("the token has no name: choose one".to_owned())),
+                ("", wanted) => wanted.to_owned(),
+                (name, wanted) if wanted.is_empty() || wanted == name => name.to_owned(),
+                (name, _) => return Err(StoreError::Denied(format!("the token is for the name {name:?}"))),
+            };
+            let membership = issue(token.role.parse()?, &name)?;
+            let member = Member::of_certificate(&membership.certificate_der)?;
+            let mut members = transaction.open_table(MEMBERS).map_err(broken)?;
+            enrol(&mut members, &member, !token.name.is_empty())?;
+            token.uses_left = token.uses_left.saturating_sub(1);
+            if token.uses_left == 0 {
+                tokens.remove(key.as_slice()).map_err(broken)?;
+            } else {
+                tokens.insert(key.as_slice(), text_of(&token)?.as_str()).map_err(broken)?;
+            }
+            membership
+        };
+        transaction.commit().map_err(broken)?;
+        Ok(membership)
+    }
+
+    /// Makes somebody a member without a token.
+    pub(crate) fn admit(&self, member: &Member) -> Result<(), StoreError> {
+        let transaction = self.database.begin_write().map_err(broken)?;
+        enrol(&mut transaction.open_table(MEMBERS).map_err(broken)?, member, true)?;
+        transaction.commit().map_err(broken)
+    }
+
+    /// Whether somebody is a member under this key.
+    pub(crate) fn is_member(&self, member: &Member) -> Result<bool, StoreError> {
+        let transaction = self.database.begin_read().map_err(broken)?;
+        let members = transaction.open_table(MEMBERS).map_err(broken)?;
+        let known = members.get(member.principal.to_string().as_str()).map_err(broken)?;
+        Ok(known.is_some_and(|key| key.value() == member.key))
+    }
+
+    /// Ends a membership; whether it was one. Certificates live on, and are worth nothing here.
+    pub(crate) fn expel(&self, principal: &Principal) -> Result<bool, StoreError> {
+        let transaction = self.database.begin_write().map_err(broken)?;
+        let was = {
+            let mut members = transaction.open_table(MEMBERS).map_err(broken)?;
+            members.remove(principal.to_string().as_str()).map_err(broken)?.is_some()
+        };
+        transaction.commit().map_err(broken)?;
+        Ok(was)
+    }
+
+    /// The URIs of all members, in order.
+    pub(crate) fn members(&self) -> Result<Vec<String>, StoreError> {
+        let transaction = self.database.begin_read().map_err(broken)?;
+        let table = transaction.open_table(MEMBERS).map_err(broken)?;
+        let uris = table.iter().map_err(broken)?.map(|entry| entry.map(|(uri, _)| uri.value().to_owned()));
+        uris.collect::<Result<_, _>>().map_err(broken)
     }
 }
 
-impl ControlStore for FileStore {
-    fn begin_epoch(&mut self) -> Result<Epoch, StartError> {
-        let last = self.last_epoch()?;
-        let next = last.checked_add(1).ok_or_else(|| fault(&self.directory, &"all epochs are used up"))?;
-        self.write_epoch(next).map_err(|error| fault(&self.directory, &error))?;
-        Ok(Epoch(next))
+fn enrol(
+    members: &mut redb::Table<'_, &str, &[u8]>,
+    member: &Member,
+    may_replace: bool,
+) -> Result<(), StoreError> {
+    let uri = member.principal.to_string();
+    let taken = members.get(uri.as_str()).map_err(broken)?.is_some_and(|key| key.value() != member.key);
+    if taken && !may_replace {
+        return Err(StoreError::Denied(format!(
+            "{uri} is there already: choose another name, or have a token made for this one"
+        )));
+    }
+    if !taken && members.len().map_err(broken)? >= MAX_MEMBERS {
+        return Err(StoreError::Denied(format!("the farm has {MAX_MEMBERS} members already")));
+    }
+    members.insert(uri.as_str(), member.key.as_slice()).map_err(broken)?;
+    Ok(())
+}
+
+fn digest(secret: &[u8]) -> [u8; 32] {
+    proto::codec::content_hash(secret).0
+}
+
+fn parse(text: &str) -> Result<Token, StoreError> {
+    serde_json::from_str(text).map_err(|error| StoreError::Broken(error.to_string()))
+}
+
+fn text_of(token: &Token) -> Result<String, StoreError> {
+    serde_json::to_string(token).map_err(|error| StoreError::Broken(error.to_string()))
+}
+
+/// The epoch that a version before the database left. Starting over at epoch 1 would let old attempts win over new ones: a file
+/// that makes no sense is an error.
+fn earlier_epoch(directory: &Path) -> Result<Option<u32>, StartError> {
+    let path = directory.join(EPOCH_FILE);
+    match fs::read(&path) {
+        Ok(bytes) => {
+            let epoch = std::str::from_utf8(&bytes).ok().and_then(|text| text.trim_end().parse().ok());
+            let garbled =
+                || fault(&path, &"does not hold an epoch; restore it, or remove it if no worker runs");
+            epoch.map(Some).ok_or_else(garbled)
+        }
+        Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(None),
+        Err(error) => Err(fault(&path, &error)),
     }
 }
 
@@ -106,6 +332,10 @@ fn fault(path: &Path, reason: &dyn ToString) -> StartError {
 
 #[cfg(test)]
 mod tests {
+    use std::time::Duration;
+
+    use proto::trust::{Authority, NewKey};
+
     use super::*;
 
     #[test]
@@ -113,50 +343,125 @@ mod tests {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("made/on/demand");
         for expected in 1..=3 {
-            assert_eq!(FileStore::open(&path).unwrap().begin_epoch().unwrap(), Epoch(expected));
+            assert_eq!(Store::open(&path).unwrap().begin_epoch().unwrap(), Epoch(expected));
         }
-        assert!(!path.join(EPOCH_DRAFT).exists(), "the draft took the file's place");
+    }
+
+    #[test]
+    fn the_epoch_of_an_earlier_version_is_taken_over_once() {
+        let directory = tempfile::tempdir().unwrap();
+        fs::write(directory.path().join(EPOCH_FILE), "41\n").unwrap();
+        assert_eq!(Store::open(directory.path()).unwrap().begin_epoch().unwrap(), Epoch(42));
+        assert_eq!(Store::open(directory.path()).unwrap().begin_epoch().unwrap(), Epoch(43));
+        for garbage in ["", "x", "-1", "4294967296", "1\n2"] {
+            fs::write(directory.path().join(EPOCH_FILE), garbage).unwrap();
+            let error = Store::open(directory.path()).unwrap_err();
+            assert!(error.to_string().contains(EPOCH_FILE), "{garbage:?}: got {error}");
+        }
     }
 
     #[test]
     fn a_directory_has_one_coordinator() {
         let directory = tempfile::tempdir().unwrap();
-        let first = FileStore::open(directory.path()).unwrap();
-        let error = FileStore::open(directory.path()).unwrap_err();
+        let first = Store::open(directory.path()).unwrap();
+        let error = Store::open(directory.path()).unwrap_err();
         assert!(error.to_string().contains("another coordinator"), "got {error}");
         drop(first);
-        FileStore::open(directory.path()).unwrap();
+        Store::open(directory.path()).unwrap();
     }
 
     #[test]
     fn without_state_lives_are_told_apart_by_the_clock() {
         // The hostile test of 2026-11-23: with epoch 1 at each start, a stranger got the id of an application of the life
         // before, and the two took over each other's session for ever.
-        assert!(MemoryStore.begin_epoch().unwrap() > Epoch(20_000_000), "the clock is past August 2026");
+        assert!(epoch_by_the_clock() > Epoch(20_000_000), "the clock is past August 2026");
     }
 
     #[test]
-    fn a_draft_left_by_a_crash_is_ignored() {
+    fn what_is_no_store_is_an_error_naming_the_file() {
         let directory = tempfile::tempdir().unwrap();
-        FileStore::open(directory.path()).unwrap().begin_epoch().unwrap();
-        fs::write(directory.path().join(EPOCH_DRAFT), "9").unwrap();
-        assert_eq!(FileStore::open(directory.path()).unwrap().begin_epoch().unwrap(), Epoch(2));
-    }
-
-    #[test]
-    fn what_cannot_be_believed_is_an_error_naming_the_file() {
-        let directory = tempfile::tempdir().unwrap();
-        for garbage in ["", "x", "-1", "4294967296", "1\n2", "00000000000000000000001"] {
-            fs::write(directory.path().join(EPOCH_FILE), garbage).unwrap();
-            let error = FileStore::open(directory.path()).unwrap().begin_epoch().unwrap_err();
-            assert!(error.to_string().contains(EPOCH_FILE), "{garbage:?}: got {error}");
-        }
-        fs::write(directory.path().join(EPOCH_FILE), u32::MAX.to_string()).unwrap();
-        let error = FileStore::open(directory.path()).unwrap().begin_epoch().unwrap_err();
-        assert!(error.to_string().contains("used up"), "got {error}");
+        fs::write(directory.path().join(FILE), vec![7; 5_000]).unwrap();
+        let error = Store::open(directory.path()).unwrap_err();
+        assert!(error.to_string().contains(FILE), "got {error}");
         let file = directory.path().join("file");
         fs::write(&file, "").unwrap();
-        let error = FileStore::open(&file).unwrap_err();
+        let error = Store::open(&file).unwrap_err();
         assert!(error.to_string().contains("file"), "got {error}");
+    }
+
+    /// A farm's store and authority, and what joining by a secret gives.
+    struct Farm {
+        _directory: tempfile::TempDir,
+        store: Store,
+        authority: Authority,
+    }
+
+    const SECRET: &[u8] = b"secret";
+    const NOW_S: u64 = 1_000;
+
+    impl Farm {
+        fn new(name: &str, uses_left: u32) -> Self {
+            let directory = tempfile::tempdir().unwrap();
+            let store = Store::open(directory.path()).unwrap();
+            let token = Token {
+                id: 0,
+                role: "node".to_owned(),
+                name: name.to_owned(),
+                expires_s: NOW_S + 60,
+                uses_left,
+                maker: String::new(),
+            };
+            store.add_token(SECRET, token, NOW_S).unwrap();
+            Self { _directory: directory, store, authority: Authority::create("farm").unwrap() }
+        }
+
+        fn join(&self, secret: &[u8], wanted: &str, now_s: u64) -> Result<Principal, String> {
+            let request = NewKey::generate().unwrap().request().unwrap();
+            let issue =
+                |role, name: &str| self.authority.admit(role, name, &request, Duration::from_secs(60));
+            let joined = self.store.join(secret, wanted, now_s, issue).map_err(|error| error.to_string())?;
+            let member = Member::of_certificate(&joined.certificate_der).unwrap();
+            assert!(self.store.is_member(&member).unwrap(), "who joined is a member");
+            Ok(member.principal)
+        }
+    }
+
+    #[test]
+    fn a_token_is_used_as_often_as_it_says_and_not_after_its_end() {
+        let farm = Farm::new("", 2);
+        assert!(farm.join(b"other", "a", NOW_S).unwrap_err().contains("cannot be used"));
+        assert!(farm.join(SECRET, "a", NOW_S + 60).unwrap_err().contains("cannot be used"), "it is over");
+        assert!(farm.join(SECRET, "", NOW_S).unwrap_err().contains("choose one"));
+        assert!(farm.join(SECRET, "no/name", NOW_S).unwrap_err().contains("letters"));
+        assert_eq!(farm.join(SECRET, "a", NOW_S).unwrap().to_string(), "gleaner://farm/node/a");
+        assert!(
+            farm.join(SECRET, "a", NOW_S).unwrap_err().contains("there already"),
+            "another key, the same name"
+        );
+        assert_eq!(farm.store.tokens(NOW_S).unwrap()[0].uses_left, 1, "what was refused used nothing");
+        farm.join(SECRET, "b", NOW_S).unwrap();
+        assert!(farm.join(SECRET, "c", NOW_S).unwrap_err().contains("cannot be used"), "used up");
+        assert_eq!(farm.store.members().unwrap(), ["gleaner://farm/node/a", "gleaner://farm/node/b"]);
+    }
+
+    #[test]
+    fn a_token_for_a_name_replaces_who_had_it() {
+        let farm = Farm::new("gpu-1", 2);
+        assert!(farm.join(SECRET, "gpu-2", NOW_S).unwrap_err().contains("gpu-1"));
+        let first = farm.join(SECRET, "", NOW_S).unwrap();
+        assert_eq!(farm.join(SECRET, "gpu-1", NOW_S).unwrap(), first, "a new key under the same name");
+        assert!(farm.store.expel(&first).unwrap());
+        assert!(!farm.store.expel(&first).unwrap(), "once");
+        assert!(farm.store.members().unwrap().is_empty());
+    }
+
+    #[test]
+    fn tokens_can_be_taken_back_and_are_forgotten_when_over() {
+        let farm = Farm::new("", 1);
+        let id = farm.store.tokens(NOW_S).unwrap()[0].id;
+        assert!(farm.store.remove_token(id).unwrap());
+        assert!(!farm.store.remove_token(id).unwrap());
+        assert!(farm.join(SECRET, "a", NOW_S).unwrap_err().contains("cannot be used"));
+        assert!(Farm::new("", 1).store.tokens(NOW_S + 60).unwrap().is_empty());
     }
 }

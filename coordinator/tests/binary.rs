@@ -64,8 +64,8 @@ async fn it_says_where_it_serves_and_ends_on_sigterm() {
     let running = Running::start(command(&ANY_PORTS));
     assert_eq!(running.ready["event"], "ready");
     // An open session does not hold the end up.
-    let mut session = proto::control::connect_node(&running.address("grpc")).await.unwrap();
-    assert!(proto::control::status(&running.address("grpc")).await.is_ok(), "it serves");
+    let mut session = proto::control::connect_node(&running.address("grpc"), None).await.unwrap();
+    assert!(proto::control::status(&running.address("grpc"), None).await.is_ok(), "it serves");
     let (code, stderr) = tokio::task::spawn_blocking(|| running.terminate()).await.unwrap();
     assert_eq!(code, Some(0), "stderr:\n{stderr}");
     assert!(stderr.contains("coordinator started"), "the log goes to stderr:\n{stderr}");
@@ -79,7 +79,7 @@ async fn lives_are_counted_in_the_state_directory() {
         let mut command = command(&ANY_PORTS);
         command.env("GLEANER_STATE", state.path());
         let running = Running::start(command);
-        let status = proto::control::status(&running.address("grpc")).await.unwrap();
+        let status = proto::control::status(&running.address("grpc"), None).await.unwrap();
         assert_eq!(status.epoch.0, expected);
         let (code, stderr) = tokio::task::spawn_blocking(|| running.terminate()).await.unwrap();
         assert_eq!(code, Some(0), "stderr:\n{stderr}");

@@ -30,7 +30,7 @@ async fn farm() -> (CoordinatorHandle, String) {
 }
 
 async fn app(address: &str, protocol: u32) -> AppSession {
-    let session = control::connect_app(address).await.unwrap();
+    let session = control::connect_app(address, None).await.unwrap();
     let hello = AppHello {
         protocol,
         name: "an app".to_owned(),
@@ -44,7 +44,7 @@ async fn app(address: &str, protocol: u32) -> AppSession {
 }
 
 async fn node(address: &str) -> NodeSessionLink {
-    let session = control::connect_node(address).await.unwrap();
+    let session = control::connect_node(address, None).await.unwrap();
     let device = DeviceInfo {
         name: "simulated".to_owned(),
         kind: DeviceKind::Simulated,
@@ -110,14 +110,14 @@ async fn an_app_and_a_node_meet_through_sessions() {
             other => assert!(!matches!(other, CoordinatorToNode::Refused { .. }), "got {other:?}"),
         }
     }
-    let status = control::status(&address).await.unwrap();
+    let status = control::status(&address, None).await.unwrap();
     assert_eq!(Some(&status), handle.status().await.as_ref());
     assert_eq!(status.nodes[0].name, "a node");
     assert_eq!(status.apps[0].outstanding_jobs, 4_096);
 
-    control::drain(&address, id).await.unwrap();
+    control::drain(&address, None, id).await.unwrap();
     assert_eq!(node.receiver.recv().await.unwrap(), CoordinatorToNode::Drain);
-    let error = control::drain(&address, NodeId(999)).await.unwrap_err();
+    let error = control::drain(&address, None, NodeId(999)).await.unwrap_err();
     assert!(matches!(&error, SessionError::Refused { reason } if reason.contains("node-999")), "got {error}");
 
     drop(app.sender);
@@ -126,7 +126,7 @@ async fn an_app_and_a_node_meet_through_sessions() {
     handle.shutdown().await;
     let ended = node.receiver.recv_end().await;
     assert!(matches!(ended, SessionError::Ended { .. }), "got {ended}");
-    let error = control::status(&address).await.unwrap_err();
+    let error = control::status(&address, None).await.unwrap_err();
     assert!(error.to_string().contains(&address), "got {error}");
 }
 
@@ -181,7 +181,7 @@ async fn a_malformed_message_ends_the_session_by_field() {
     assert_eq!(status.code(), tonic::Code::InvalidArgument);
     assert!(status.message().contains("AppHello.weight"), "got {status}");
     // The coordinator goes on.
-    assert!(control::status(&address).await.is_ok(), "it still answers");
+    assert!(control::status(&address, None).await.is_ok(), "it still answers");
 }
 
 #[tokio::test]
@@ -193,14 +193,14 @@ async fn wrong_addresses_are_named() {
         ("127.0.0.1:0", "1 to 65535"),
         ("a b:1", "a b:1"),
     ] {
-        let error = control::status(address).await.unwrap_err();
+        let error = control::status(address, None).await.unwrap_err();
         assert!(matches!(error, SessionError::Address { .. }), "{address}: got {error}");
         assert!(error.to_string().contains(part), "{address}: got {error}");
     }
     let unused = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
     let address = unused.local_addr().unwrap().to_string();
     drop(unused);
-    let error = control::connect_node(&address).await.map(|_| ()).unwrap_err();
+    let error = control::connect_node(&address, None).await.map(|_| ()).unwrap_err();
     assert!(matches!(error, SessionError::Unreachable { .. }), "got {error}");
     assert!(error.to_string().contains("refused"), "the root cause: {error}");
 }

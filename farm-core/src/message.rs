@@ -257,6 +257,8 @@ pub enum CoordinatorToApp {
         /// Of the heartbeat answered.
         sequence: u64,
     },
+    /// What to show to nodes of a secured farm from now on. From driver to driver: the machines know nothing of it.
+    Capability(Vec<u8>),
 }
 
 // ---------------------------------------------------------------- node <-> coordinator

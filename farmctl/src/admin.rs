@@ -7,47 +7,85 @@ use farm_core::{
     },
     id::NodeId,
 };
-use proto::control::{self, SessionError};
+use proto::{
+    control::{self, Invitation, SessionError, v1::TokenStatus},
+    trust::{Identity, JoinToken},
+};
 
-use crate::failure::Failure;
-
-/// Where `farmctl up` and `farm-coordinator` listen unless told otherwise.
-const DEFAULT_COORDINATOR: &str = "127.0.0.1:7700";
+use crate::{failure::Failure, target::Reach};
 
 /// The coordinator that operator verbs talk to.
 #[derive(Debug)]
-pub(crate) struct Admin<'a> {
-    address: &'a str,
+pub(crate) struct Admin {
+    reach: Reach,
 }
 
-impl<'a> Admin<'a> {
-    /// The configured coordinator, or the one at the usual place.
-    pub(crate) fn new(coordinator: Option<&'a str>) -> Self {
-        Self { address: coordinator.unwrap_or(DEFAULT_COORDINATOR) }
+impl Admin {
+    pub(crate) const fn new(reach: Reach) -> Self {
+        Self { reach }
+    }
+
+    fn to(&self) -> (&str, Option<&Identity>) {
+        (&self.reach.address, self.reach.identity.as_ref())
     }
 
     /// How the farm stands.
     pub(crate) async fn status(&self) -> Result<FarmStatus, Failure> {
-        control::status(self.address).await.map_err(failure)
+        let (address, identity) = self.to();
+        control::status(address, identity).await.map_err(failure)
     }
 
     /// What ran when and where.
     pub(crate) async fn timeline(&self, query: TimelineQuery) -> Result<Timeline, Failure> {
-        control::timeline(self.address, query).await.map_err(failure)
+        let (address, identity) = self.to();
+        control::timeline(address, identity, query).await.map_err(failure)
     }
 
     /// Lets a node finish and leave.
     pub(crate) async fn drain(&self, node: NodeId) -> Result<(), Failure> {
-        control::drain(self.address, node).await.map_err(failure)
+        let (address, identity) = self.to();
+        control::drain(address, identity, node).await.map_err(failure)
+    }
+
+    /// Makes a join token; gives its number, too.
+    pub(crate) async fn create_token(&self, invitation: &Invitation) -> Result<(u64, JoinToken), Failure> {
+        let (address, identity) = self.to();
+        control::create_token(address, identity, invitation).await.map_err(failure)
+    }
+
+    /// The tokens that can still be used.
+    pub(crate) async fn tokens(&self) -> Result<Vec<TokenStatus>, Failure> {
+        let (address, identity) = self.to();
+        control::list_tokens(address, identity).await.map_err(failure)
+    }
+
+    /// Takes a token back.
+    pub(crate) async fn revoke_token(&self, id: u64) -> Result<(), Failure> {
+        let (address, identity) = self.to();
+        control::revoke_token(address, identity, id).await.map_err(failure)
+    }
+
+    /// The URIs of the farm's members.
+    pub(crate) async fn members(&self) -> Result<Vec<String>, Failure> {
+        let (address, identity) = self.to();
+        control::list_members(address, identity).await.map_err(failure)
+    }
+
+    /// Ends a membership.
+    pub(crate) async fn expel(&self, uri: &str) -> Result<(), Failure> {
+        let (address, identity) = self.to();
+        control::expel(address, identity, uri).await.map_err(failure)
     }
 }
 
-fn failure(error: SessionError) -> Failure {
+/// What a failed request is to the one who asked.
+pub(crate) fn failure(error: SessionError) -> Failure {
     match error {
         SessionError::Address { .. } => Failure::Usage(error.into()),
         SessionError::Unreachable { .. } => Failure::Unreachable(anyhow::Error::new(error).context(
             "no farm answers; start one with `farmctl up`, or name it with --coordinator or GLEANER_COORDINATOR",
         )),
+        SessionError::Denied { .. } => Failure::Denied(error.into()),
         SessionError::Ended { .. }
         | SessionError::Malformed { .. }
         | SessionError::Refused { .. }

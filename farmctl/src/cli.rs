@@ -5,7 +5,7 @@ use std::{path::PathBuf, str::FromStr, time::Duration};
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use mi_kernel::generate::RandomAlignment;
 
-use crate::failure::Failure;
+use crate::{failure::Failure, target::Target};
 
 /// Gleaner: a GPU compute farm whose idle devices glean work from busy ones.
 #[derive(Debug, Parser)]
@@ -14,6 +14,21 @@ pub(crate) struct Cli {
     /// The farm's coordinator; without one, `render` and `mi` start a farm of their own, as `bench` always does.
     #[arg(long, env = "GLEANER_COORDINATOR", value_name = "HOST:PORT")]
     pub coordinator: Option<String>,
+    /// Who you are in a secured farm: what `init` or `join` has written; there, where it is written to
+    /// [default: ~/.config/gleaner/user.pem, of nodes node.pem].
+    #[arg(long, env = "GLEANER_IDENTITY", value_name = "FILE", global = true)]
+    pub identity: Option<PathBuf>,
+    /// Speak to a farm that is not secured, whatever identity there is.
+    #[arg(
+        long,
+        env = "GLEANER_INSECURE",
+        num_args = 0..=1,
+        default_missing_value = "true",
+        require_equals = true,
+        global = true,
+        value_parser = clap::builder::BoolishValueParser::new()
+    )]
+    pub insecure: Option<bool>,
     /// How reads are printed.
     #[arg(short = 'o', long, value_enum, default_value_t = Format::Table, id = "format")]
     pub output: Format,
@@ -22,8 +37,14 @@ pub(crate) struct Cli {
 }
 
 impl Cli {
+    /// The farm asked for.
+    pub(crate) fn target(&self) -> Result<Target<'_>, Failure> {
+        let identity = self.identity.as_deref().filter(|path| !path.as_os_str().is_empty());
+        Ok(Target::new(self.coordinator()?, identity, self.insecure.unwrap_or(false)))
+    }
+
     /// The coordinator asked for; an empty variable is none.
-    pub(crate) fn coordinator(&self) -> Result<Option<&str>, Failure> {
+    fn coordinator(&self) -> Result<Option<&str>, Failure> {
         let Some(address) = self.coordinator.as_deref().filter(|address| !address.is_empty()) else {
             return Ok(None);
         };
@@ -70,6 +91,16 @@ pub(crate) enum Verb {
     /// Look after nodes.
     #[command(subcommand)]
     Node(NodeVerb),
+    /// Secure a farm: make its authority in a coordinator's state folder, and you its first operator.
+    Init(InitArgs),
+    /// Become a member of a secured farm, by a token of its operator.
+    Join(JoinArgs),
+    /// Look after join tokens.
+    #[command(subcommand)]
+    Token(TokenVerb),
+    /// Look after members.
+    #[command(subcommand)]
+    Member(MemberVerb),
     /// Measure the farm against its bars.
     Bench(BenchArgs),
     /// Print versions.
@@ -283,6 +314,75 @@ pub(crate) enum NodeVerb {
     Drain {
         /// The node's name or id.
         node: String,
+    },
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct InitArgs {
+    /// The state folder, as in `farm-coordinator --state DIR`.
+    pub state: PathBuf,
+    /// The farm's name.
+    #[arg(long, value_name = "NAME", default_value = "farm")]
+    pub farm: String,
+    /// Your name as its operator.
+    #[arg(long, value_name = "NAME", default_value = "operator")]
+    pub operator: String,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct JoinArgs {
+    /// The token; `-` reads it from standard input, which keeps it out of the list of processes.
+    pub token: String,
+    /// Your name in the farm, where the token has none: of a node its name, else your project's [default: this host's].
+    #[arg(long, value_name = "NAME")]
+    pub name: Option<String>,
+}
+
+#[derive(Debug, Subcommand)]
+pub(crate) enum TokenVerb {
+    /// Make a token.
+    Create {
+        /// What who joins becomes: a node gives devices, an app brings jobs, an operator does that and drains nodes and makes tokens.
+        #[arg(value_enum)]
+        role: MemberRole,
+        /// The name that who joins gets; who has it now loses it. Without: any that nobody has.
+        #[arg(long, value_name = "NAME")]
+        name: Option<String>,
+        /// How long the token can be used.
+        #[arg(long, value_name = "DURATION", default_value = "1h", value_parser = duration)]
+        expires: Duration,
+        /// How often it can be used.
+        #[arg(long, default_value_t = 1)]
+        uses: u32,
+    },
+    /// List the tokens that can still be used.
+    Ls,
+    /// Take a token back.
+    Revoke {
+        /// Its number.
+        id: u64,
+    },
+}
+
+/// What a token makes of who joins.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub(crate) enum MemberRole {
+    /// Gives devices.
+    Node,
+    /// Brings jobs.
+    App,
+    /// Brings jobs, drains nodes, makes tokens.
+    Operator,
+}
+
+#[derive(Debug, Subcommand)]
+pub(crate) enum MemberVerb {
+    /// List the farm's members.
+    Ls,
+    /// End a membership; the sessions it has go on until they end.
+    Expel {
+        /// Whose: gleaner://FARM/ROLE/NAME, as `ls` says.
+        member: String,
     },
 }
 

@@ -6,7 +6,10 @@ use coordinator::{CoordinatorHandle, CoordinatorOptions};
 use gpu_exec::DeviceSpec;
 use worker::{WorkerHandle, WorkerOptions};
 
-use crate::failure::Failure;
+use crate::{
+    failure::Failure,
+    target::{Reach, Target},
+};
 
 /// A running embedded farm.
 #[derive(Debug)]
@@ -19,6 +22,18 @@ impl EmbeddedFarm {
     /// Starts a farm over `devices` (all found when empty) on ports of the system's choice.
     pub(crate) async fn start(devices: &[String]) -> Result<Self, Failure> {
         Self::start_with(CoordinatorOptions::embedded(), devices).await
+    }
+
+    /// The farm that was named; where none was, one of our own over `devices`.
+    pub(crate) async fn unless_named(
+        target: &Target<'_>,
+        devices: &[String],
+    ) -> Result<(Reach, Option<Self>), Failure> {
+        if let Some(reach) = target.named().await? {
+            return Ok((reach, None));
+        }
+        let farm = Self::start(devices).await?;
+        Ok((Reach::open(&farm.grpc()), Some(farm)))
     }
 
     /// Starts a farm whose coordinator has these options.

@@ -2,6 +2,8 @@
 
 use std::process::ExitCode;
 
+use client_sdk::FarmError;
+
 /// Why a command failed, as its exit code sees it.
 #[derive(Debug)]
 pub(crate) enum Failure {
@@ -11,6 +13,8 @@ pub(crate) enum Failure {
     Usage(anyhow::Error),
     /// The coordinator cannot be reached.
     Unreachable(anyhow::Error),
+    /// The farm does not let us, or is not ours.
+    Denied(anyhow::Error),
 }
 
 impl Failure {
@@ -20,12 +24,13 @@ impl Failure {
             Self::Work(_) => 1,
             Self::Usage(_) => 2,
             Self::Unreachable(_) => 3,
+            Self::Denied(_) => 4,
         })
     }
 
     /// The causes in one line, for stderr; one whose words are in the one before already is not repeated.
     pub(crate) fn describe(&self) -> String {
-        let (Self::Work(error) | Self::Usage(error) | Self::Unreachable(error)) = self;
+        let (Self::Work(error) | Self::Usage(error) | Self::Unreachable(error) | Self::Denied(error)) = self;
         let mut text = String::new();
         for cause in error.chain().map(ToString::to_string) {
             if text.is_empty() {
@@ -35,6 +40,19 @@ impl Failure {
             }
         }
         text
+    }
+}
+
+/// A run that failed, by its cause.
+impl Failure {
+    pub(crate) fn of_run(error: FarmError) -> Self {
+        match error {
+            FarmError::Unreachable { .. } | FarmError::CoordinatorLost { .. } => {
+                Self::Unreachable(error.into())
+            }
+            FarmError::Denied { .. } => Self::Denied(error.into()),
+            error => Self::Work(error.into()),
+        }
     }
 }
 

@@ -19,6 +19,7 @@ mod output;
 mod process_farm;
 mod progress;
 mod running;
+mod target;
 mod timeline;
 
 use std::process::ExitCode;
@@ -51,16 +52,20 @@ fn main() -> ExitCode {
 fn run(cli: &Cli) -> Result<(), Failure> {
     let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build()?;
     let result = runtime.block_on(async {
-        let coordinator = cli.coordinator()?;
+        let target = &cli.target()?;
         match &cli.verb {
             Verb::Up(arguments) => command::up::run(arguments).await,
-            Verb::Render(arguments) => Box::pin(command::render::run(arguments, coordinator)).await,
-            Verb::Mi(arguments) => Box::pin(command::mi::run(arguments, coordinator)).await,
+            Verb::Render(arguments) => Box::pin(command::render::run(arguments, target)).await,
+            Verb::Mi(arguments) => Box::pin(command::mi::run(arguments, target)).await,
             Verb::Scene(arguments) => command::scene::run(arguments),
             Verb::Alignment(arguments) => command::alignment::run(arguments),
-            Verb::Status(arguments) => command::status::run(arguments, coordinator, cli.output).await,
-            Verb::Timeline(arguments) => command::timeline::run(arguments, coordinator, cli.output).await,
-            Verb::Node(verb) => command::node::run(verb, coordinator).await,
+            Verb::Status(arguments) => command::status::run(arguments, target, cli.output).await,
+            Verb::Timeline(arguments) => command::timeline::run(arguments, target, cli.output).await,
+            Verb::Node(verb) => command::node::run(verb, target).await,
+            Verb::Init(arguments) => command::membership::init(arguments, target),
+            Verb::Join(arguments) => command::membership::join(arguments, target).await,
+            Verb::Token(verb) => command::membership::token(verb, target, cli.output).await,
+            Verb::Member(verb) => command::membership::member(verb, target, cli.output).await,
             Verb::Bench(arguments) => {
                 Box::pin(bench::run(arguments, arguments.output.unwrap_or(cli.output))).await
             }

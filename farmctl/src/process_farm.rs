@@ -71,7 +71,7 @@ impl ProcessFarm {
         let settings = worker_settings(shape.local_stealing)?;
         let mut coordinator = Daemon::start(
             "farm-coordinator",
-            ["--listen", "127.0.0.1:0", "--http", "127.0.0.1:0"].map(OsString::from),
+            ["--insecure", "--listen", "127.0.0.1:0", "--http", "127.0.0.1:0"].map(OsString::from),
         )?;
         let ready = coordinator.ready()?;
         let grpc = ready["grpc"]
@@ -82,7 +82,7 @@ impl ProcessFarm {
         for (number, devices) in shape.workers.iter().enumerate() {
             let name = format!("bench-{number}");
             let mut arguments: Vec<OsString> =
-                ["--coordinator", &grpc, "--listen", "127.0.0.1:0", "--name", &name]
+                ["--insecure", "--coordinator", &grpc, "--listen", "127.0.0.1:0", "--name", &name]
                     .map(OsString::from)
                     .into();
             arguments.extend(["--config".into(), settings.path().into()]);

@@ -7,3 +7,4 @@ pub mod codec;
 pub mod control;
 pub mod link;
 pub mod tls;
+pub mod trust;

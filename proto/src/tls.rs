@@ -1,7 +1,8 @@
-//! TLS of the data plane: a node's self-signed certificate and the application's check of it.
+//! TLS of both planes (TLS 1.3 only, no 0-RTT).
 //!
-//! The application trusts exactly the certificate that the coordinator's plan names (TLS 1.3 only, no 0-RTT); there is no
-//! authority, no name check and no expiry. It never decides who may join: a later issue brings the farm's own authority.
+//! Data plane: an application trusts exactly the node certificate that the coordinator's plan names; there is no name check
+//! and no expiry. In a secured farm the node asks for the application's identity in turn. Control plane of a secured farm:
+//! both ends show identities of the farm's authority (`trust`). Who may do what is not decided here.
 
 use std::sync::Arc;
 
@@ -14,8 +15,15 @@ use rustls::{
 };
 use thiserror::Error;
 
-/// What both ends must speak; a peer of another protocol is refused in the handshake.
+use crate::trust::{
+    Identity, Member,
+    verify::{CoordinatorCheck, MemberCheck},
+};
+
+/// What both ends of the data plane must speak; a peer of another protocol is refused in the handshake.
 const ALPN: &[u8] = b"gleaner-data/1";
+/// What both ends of the control plane speak.
+const HTTP_2: &[u8] = b"h2";
 /// The name in every node certificate. Nobody compares it: the pinned bytes say who it is.
 pub(crate) const NODE_NAME: &str = "gleaner-node";
 
@@ -55,12 +63,16 @@ impl NodeCertificate {
         &self.certificate
     }
 
-    /// The server's side.
-    pub(crate) fn server_config(&self) -> Result<QuicServerConfig, TlsError> {
-        let mut config = rustls::ServerConfig::builder_with_provider(provider())
+    /// The server's side; with an identity, for members of its farm alone.
+    pub(crate) fn server_config(&self, identity: Option<&Identity>) -> Result<QuicServerConfig, TlsError> {
+        let builder = rustls::ServerConfig::builder_with_provider(provider())
             .with_protocol_versions(&[&rustls::version::TLS13])
-            .map_err(configuration)?
-            .with_no_client_auth()
+            .map_err(configuration)?;
+        let builder = match identity {
+            Some(identity) => builder.with_client_cert_verifier(members(identity, true)),
+            None => builder.with_no_client_auth(),
+        };
+        let mut config = builder
             .with_single_cert(vec![self.certificate.clone()], self.key.clone_key())
             .map_err(configuration)?;
         config.alpn_protocols = vec![ALPN.to_vec()];
@@ -71,23 +83,79 @@ impl NodeCertificate {
     }
 }
 
-/// The client's side: accepts the one certificate given, nothing else.
-pub(crate) fn pinned_client_config(certificate_der: &[u8]) -> Result<QuicClientConfig, TlsError> {
+/// The client's side: accepts the one certificate given, nothing else, and shows its identity if it has one.
+pub(crate) fn pinned_client_config(
+    certificate_der: &[u8],
+    identity: Option<&Identity>,
+) -> Result<QuicClientConfig, TlsError> {
     let provider = provider();
     let verifier = PinnedCertificate {
         expected: CertificateDer::from(certificate_der.to_vec()),
         algorithms: provider.signature_verification_algorithms,
     };
-    let mut config = rustls::ClientConfig::builder_with_provider(provider)
+    let mut config = client_config(Arc::new(verifier), identity)?;
+    config.alpn_protocols = vec![ALPN.to_vec()];
+    QuicClientConfig::try_from(config).map_err(|error| TlsError::Configuration(error.to_string()))
+}
+
+/// The coordinator's side of the control plane. Who joins has no certificate yet: what it may say is asked afterwards.
+pub(crate) fn control_server_config(identity: &Identity) -> Result<rustls::ServerConfig, TlsError> {
+    let mut config = rustls::ServerConfig::builder_with_provider(provider())
+        .with_protocol_versions(&[&rustls::version::TLS13])
+        .map_err(configuration)?
+        .with_client_cert_verifier(members(identity, false))
+        .with_cert_resolver(Arc::new(identity.clone()));
+    config.alpn_protocols = vec![HTTP_2.to_vec()];
+    config.max_early_data_size = 0;
+    config.send_tls13_tickets = 0;
+    Ok(config)
+}
+
+/// A member's side of the control plane.
+pub(crate) fn control_client_config(identity: &Identity) -> Result<rustls::ClientConfig, TlsError> {
+    let check = CoordinatorCheck::Authority(identity.authority().clone());
+    control_client(check, Some(identity))
+}
+
+/// The side of who joins: it knows the coordinator by the blake3 of the farm's authority.
+pub(crate) fn join_client_config(authority: [u8; 32]) -> Result<rustls::ClientConfig, TlsError> {
+    control_client(CoordinatorCheck::Fingerprint(authority), None)
+}
+
+fn control_client(
+    check: CoordinatorCheck,
+    identity: Option<&Identity>,
+) -> Result<rustls::ClientConfig, TlsError> {
+    let mut config = client_config(Arc::new(check), identity)?;
+    config.alpn_protocols = vec![HTTP_2.to_vec()];
+    Ok(config)
+}
+
+fn client_config(
+    verifier: Arc<dyn ServerCertVerifier>,
+    identity: Option<&Identity>,
+) -> Result<rustls::ClientConfig, TlsError> {
+    let builder = rustls::ClientConfig::builder_with_provider(provider())
         .with_protocol_versions(&[&rustls::version::TLS13])
         .map_err(configuration)?
         .dangerous()
-        .with_custom_certificate_verifier(Arc::new(verifier))
-        .with_no_client_auth();
-    config.alpn_protocols = vec![ALPN.to_vec()];
+        .with_custom_certificate_verifier(verifier);
+    let mut config = match identity {
+        Some(identity) => builder.with_client_cert_resolver(Arc::new(identity.clone())),
+        None => builder.with_no_client_auth(),
+    };
     config.enable_early_data = false;
     config.resumption = rustls::client::Resumption::disabled();
-    QuicClientConfig::try_from(config).map_err(|error| TlsError::Configuration(error.to_string()))
+    Ok(config)
+}
+
+fn members(identity: &Identity, mandatory: bool) -> Arc<MemberCheck> {
+    Arc::new(MemberCheck { authority: identity.authority().clone(), mandatory })
+}
+
+/// Whose certificate a peer has shown; the handshake has checked that it is a member's.
+pub(crate) fn member(shown: Option<&[CertificateDer<'_>]>) -> Option<Member> {
+    Member::of_certificate(shown?.first()?).ok()
 }
 
 /// Accepts exactly one certificate, and only from who holds its key.

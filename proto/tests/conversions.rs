@@ -198,6 +198,7 @@ fn coordinator_to_app() -> impl Strategy<Value = CoordinatorToApp> {
             CoordinatorToApp::JobFailed { job, failure }
         }),
         any::<u64>().prop_map(|sequence| CoordinatorToApp::HeartbeatAck { sequence }),
+        vec(any::<u8>(), 0..80).prop_map(CoordinatorToApp::Capability),
     ]
 }
 

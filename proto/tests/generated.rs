@@ -2,8 +2,13 @@
 
 use std::{fs, path::Path};
 
-const PROTOS: [&str; 4] =
-    ["gleaner/v1/admin.proto", "gleaner/v1/apps.proto", "gleaner/v1/model.proto", "gleaner/v1/nodes.proto"];
+const PROTOS: [&str; 5] = [
+    "gleaner/v1/admin.proto",
+    "gleaner/v1/apps.proto",
+    "gleaner/v1/model.proto",
+    "gleaner/v1/nodes.proto",
+    "gleaner/v1/trust.proto",
+];
 const GENERATED: &str = "gleaner.v1.rs";
 
 #[test]

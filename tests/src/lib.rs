@@ -42,6 +42,16 @@ pub fn binary(name: &str) -> PathBuf {
     path
 }
 
+/// A workspace binary that does not know the farms of whoever runs the tests.
+fn command(name: &str) -> Command {
+    let mut command = Command::new(binary(name));
+    command
+        .env_remove("GLEANER_COORDINATOR")
+        .env_remove("GLEANER_IDENTITY")
+        .env("XDG_CONFIG_HOME", "/nonexistent");
+    command
+}
+
 /// A child process whose stdout is read line by line, killed when dropped.
 #[derive(Debug)]
 pub struct Process {
@@ -85,9 +95,8 @@ impl Process {
         arguments: impl IntoIterator<Item = S>,
         stderr: Stdio,
     ) -> Self {
-        let mut child = Command::new(binary(name))
+        let mut child = command(name)
             .args(arguments)
-            .env_remove("GLEANER_COORDINATOR")
             .stdin(Stdio::null())
             .stdout(Stdio::piped())
             .stderr(stderr)
@@ -268,10 +277,5 @@ impl Farm {
 /// # Panics
 /// It cannot be started.
 pub fn farmctl<S: AsRef<OsStr>>(arguments: impl IntoIterator<Item = S>) -> Output {
-    Command::new(binary("farmctl"))
-        .args(arguments)
-        .env_remove("GLEANER_COORDINATOR")
-        .stdin(Stdio::null())
-        .output()
-        .expect("farmctl starts")
+    command("farmctl").args(arguments).stdin(Stdio::null()).output().expect("farmctl starts")
 }

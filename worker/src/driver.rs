@@ -4,7 +4,7 @@
 use std::{
     collections::{HashMap, HashSet},
     sync::Arc,
-    time::{Duration, Instant},
+    time::{Duration, Instant, SystemTime},
 };
 
 use bytes::Bytes;
@@ -20,6 +20,7 @@ use proto::{
     codec,
     control::{SessionError, SessionSender},
     link::{DataServer, Frame, LinkSender},
+    trust::{Capability, Principal},
 };
 use tokio::{
     sync::{mpsc, oneshot},
@@ -54,7 +55,7 @@ pub(crate) enum Input {
     /// Session `serial` is over.
     CoordinatorEnded { serial: u64, error: SessionError },
     /// An application dialled.
-    LinkOpened { link: LinkId, sender: LinkSender<NodeToApp> },
+    LinkOpened { link: LinkId, sender: LinkSender<NodeToApp>, peer: Option<Principal> },
     /// An application said this, in order.
     AppSaid { link: LinkId, frames: Vec<Frame<AppToNode>> },
     /// An application's link is over.
@@ -126,6 +127,9 @@ pub(crate) async fn drive(setup: Setup) -> End {
     };
     let shelf = driver.contents.shelf().clone();
     driver.tasks.spawn(link::accept(Arc::clone(&server), shelf, inputs));
+    if let Some(identity) = &driver.options.identity {
+        driver.tasks.spawn(session::stay_valid(driver.options.coordinator.clone(), identity.clone()));
+    }
     driver.connected(session);
     let mut taken = Vec::with_capacity(INPUTS_PER_TURN);
     let mut heard = Vec::with_capacity(INPUTS_PER_TURN);
@@ -204,8 +208,8 @@ impl Driver {
                 self.coordinator_lost(&error)
             }
             Input::CoordinatorSaid { .. } | Input::CoordinatorEnded { .. } => {}
-            Input::LinkOpened { link, sender } => {
-                self.links.insert(link, Outbox::new(sender));
+            Input::LinkOpened { link, sender, peer } => {
+                self.links.insert(link, Outbox::new(sender, peer));
             }
             Input::AppSaid { link, frames } => {
                 for frame in frames {
@@ -253,16 +257,51 @@ impl Driver {
     }
 
     fn coordinator_lost(&mut self, error: &SessionError) {
+        if let (SessionError::Denied { reason }, true) = (error, self.registered.is_some()) {
+            self.end = Some(End::Denied { reason: reason.clone() });
+            return;
+        }
         tracing::warn!(%error, "the coordinator is lost; work goes on, trying again");
         self.coordinator = None;
         self.serial += 1;
         self.tell(Event::CoordinatorLost);
-        self.tasks.spawn(session::again(self.options.coordinator.clone(), self.inputs.clone()));
+        self.tasks.spawn(session::again(
+            self.options.coordinator.clone(),
+            self.options.identity.clone(),
+            self.inputs.clone(),
+        ));
         // Ended tasks of earlier sessions.
         while self.tasks.try_join_next().is_some() {}
     }
 
+    /// Whether an application may say this hello here: in a secured farm the coordinator has to have said so.
+    ///
+    /// # Errors
+    /// It may not.
+    fn check_hello(&self, link: LinkId, frame: &Frame<AppToNode>) -> Result<(), String> {
+        let (Some(own), AppToNode::Hello { app, incarnation, .. }) = (&self.options.identity, &frame.header)
+        else {
+            return Ok(());
+        };
+        let peer = self.links.get(&link).and_then(Outbox::peer).ok_or("nobody has shown who this is")?;
+        let shown = Capability::check(&frame.payload, own, peer, SystemTime::now())
+            .map_err(|error| error.to_string())?;
+        if (shown.app, shown.incarnation) == (*app, *incarnation) {
+            Ok(())
+        } else {
+            Err(format!("the capability is for {}, {}", shown.app, shown.incarnation))
+        }
+    }
+
     fn app_said(&mut self, link: LinkId, frame: Frame<AppToNode>) {
+        if let Err(reason) = self.check_hello(link, &frame) {
+            tracing::warn!(%link, reason, "an application was refused");
+            if let Some(outbox) = self.links.remove(&link) {
+                outbox.send(NodeToApp::Refused { reason }, Vec::new());
+                outbox.close("refused");
+            }
+            return;
+        }
         if let AppToNode::Jobs(tickets) = &frame.header {
             match codec::unpack_programs(frame.payload, tickets.len()) {
                 Ok(programs) => {
@@ -404,8 +443,9 @@ impl Driver {
                 });
             }
             Provider::Node(contact) => {
+                let identity = self.options.identity.clone();
                 tokio::spawn(async move {
-                    let result = link::fetch_from_peer(contact, content).await;
+                    let result = link::fetch_from_peer(contact, identity, content).await;
                     let _ = inputs.send(Input::Fetched { content, result }).await;
                 });
             }

@@ -22,6 +22,7 @@ use gpu_exec::{DeviceSpec, ExecutorConfig, OpenError};
 use proto::{
     control::SessionError,
     link::{BindError, DataServer},
+    trust::Identity,
 };
 use thiserror::Error;
 use tokio::{
@@ -59,6 +60,8 @@ pub struct WorkerOptions {
     pub local_stealing: bool,
     /// How devices are shared between applications.
     pub share: Share,
+    /// Who this node is in a secured farm; without it, everyone who reaches it can use it.
+    pub identity: Option<Identity>,
     /// A folder for caches on disk. Checked to be writable; what is cached there comes with a later version.
     pub cache: Option<PathBuf>,
 }
@@ -79,6 +82,7 @@ impl WorkerOptions {
             job_limit: Duration::from_secs(600),
             local_stealing: true,
             share: Share::DEFAULT,
+            identity: None,
             cache: None,
         }
     }
@@ -104,6 +108,12 @@ pub enum StartError {
         /// Why not.
         source: std::io::Error,
     },
+    /// The farm does not let this node in, or is not the node's.
+    #[error("denied: {reason}")]
+    Denied {
+        /// Why.
+        reason: String,
+    },
     /// The coordinator cannot be reached. May be retried.
     #[error("no coordinator answered within {1:?}")]
     Unreachable(#[source] SessionError, Duration),
@@ -123,6 +133,11 @@ pub enum StartError {
 pub enum End {
     /// Drained: it holds no job any more and said goodbye.
     Drained,
+    /// The farm does not let it in.
+    Denied {
+        /// Why.
+        reason: String,
+    },
     /// The coordinator does not want it any more.
     Refused {
         /// Its reason.
@@ -144,6 +159,8 @@ pub struct WorkerInfo {
     pub node: NodeId,
     /// Where its data plane listens.
     pub data: SocketAddr,
+    /// How applications reach it, as plans say it.
+    pub contact: Contact,
     /// Its devices.
     pub devices: Vec<DeviceInfo>,
 }
@@ -201,25 +218,29 @@ pub async fn start(options: WorkerOptions) -> Result<WorkerHandle, StartError> {
     let (events_sender, events) = mpsc::unbounded_channel();
     let devices = open_devices(options.devices.clone(), events_sender).await?;
     let infos: Vec<DeviceInfo> = devices.iter().map(|executor| executor.info().clone()).collect();
-    let server = Arc::new(DataServer::bind(options.listen)?);
+    let server = Arc::new(DataServer::bind(options.listen, options.identity.as_ref())?);
     let data = server.local_addr();
     let advertise =
         if options.advertise.is_empty() { vec![data.to_string()] } else { options.advertise.clone() };
+    let contact = Contact { addresses: advertise, certificate_der: server.certificate_der().to_vec() };
     let identity = random_u64()?;
     let config = WorkerConfig {
         name: options.name.clone(),
         session: NodeSession(identity),
         devices: infos.clone(),
-        contact: Contact { addresses: advertise, certificate_der: server.certificate_der().to_vec() },
+        contact: contact.clone(),
         max_jobs: MAX_JOBS,
         spool_quota_bytes: options.spool_quota_bytes,
         local_stealing: options.local_stealing,
         share: options.share,
         seed: identity,
     };
-    let session = session::first(&options.coordinator, options.connect_timeout)
+    let session = session::first(&options.coordinator, options.identity.as_ref(), options.connect_timeout)
         .await
-        .map_err(|error| StartError::Unreachable(error, options.connect_timeout))?;
+        .map_err(|error| match error {
+            SessionError::Denied { reason } => StartError::Denied { reason },
+            error => StartError::Unreachable(error, options.connect_timeout),
+        })?;
 
     let (inputs, received) = mpsc::channel(QUEUED_INPUTS);
     let (registered, registration) = oneshot::channel();
@@ -240,6 +261,7 @@ pub async fn start(options: WorkerOptions) -> Result<WorkerHandle, StartError> {
         Ok(node) = registration => node,
         end = &mut driver => {
             let reason = match end {
+                Ok(End::Denied { reason }) => return Err(StartError::Denied { reason }),
                 Ok(End::Refused { reason } | End::Failed { reason }) => reason,
                 Ok(End::Drained) => "it ended before it was registered".to_owned(),
                 Err(error) => error.to_string(),
@@ -252,7 +274,8 @@ pub async fn start(options: WorkerOptions) -> Result<WorkerHandle, StartError> {
             return Err(StartError::Unreachable(SessionError::Ended { reason }, options.connect_timeout));
         }
     };
-    Ok(WorkerHandle { info: WorkerInfo { name: options.name, node, data, devices: infos }, inputs, driver })
+    let info = WorkerInfo { name: options.name, node, data, contact, devices: infos };
+    Ok(WorkerHandle { info, inputs, driver })
 }
 
 /// Opens the executors on a thread that may block: a score is measured for up to a second a device.

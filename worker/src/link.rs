@@ -12,7 +12,10 @@ use farm_core::{
     message::{AppToNode, Contact, NodeToApp},
     program::Content,
 };
-use proto::link::{ContentSource, DataServer, Frame, Link, LinkReceiver, LinkSender, TrySendError};
+use proto::{
+    link::{ContentSource, DataServer, Frame, Link, LinkReceiver, LinkSender, TrySendError},
+    trust::{Identity, Principal, Role},
+};
 use tokio::sync::mpsc;
 
 use crate::{content::Shelf, driver::Input};
@@ -28,19 +31,31 @@ pub(crate) async fn accept(server: Arc<DataServer>, shelf: Shelf, inputs: mpsc::
         next += 1;
         let (inputs, shelf) = (inputs.clone(), shelf.clone());
         tokio::spawn(async move {
-            // Whoever knows a content's digest may have it.
-            match incoming.establish(ContentSource::new(move |hash| shelf.get(&hash))).await {
-                Ok(Link { sender, receiver }) => read(link, sender, receiver, inputs).await,
+            match incoming.establish(|peer| fetchable(shelf, peer)).await {
+                Ok((Link { sender, receiver }, peer)) => read(link, sender, receiver, peer, inputs).await,
                 Err(error) => tracing::debug!(%link, %error, "a link was not made"),
             }
         });
     }
 }
 
+/// What a peer may fetch here: nodes, and in an open farm everyone, what they know the digest of; applications nothing.
+fn fetchable(shelf: Shelf, peer: Option<&Principal>) -> ContentSource {
+    match peer {
+        None | Some(Principal { role: Role::Node, .. }) => ContentSource::new(move |hash| shelf.get(&hash)),
+        Some(_) => ContentSource::empty(),
+    }
+}
+
 /// Fetches a content from another node's shelf, on a link of its own: its handshake is little beside a large content.
-pub(crate) async fn fetch_from_peer(contact: Contact, content: Content) -> Result<Bytes, String> {
+pub(crate) async fn fetch_from_peer(
+    contact: Contact,
+    identity: Option<Identity>,
+    content: Content,
+) -> Result<Bytes, String> {
+    let Contact { addresses, certificate_der } = contact;
     let link: Link<AppToNode, NodeToApp> =
-        proto::link::connect(&contact.addresses, &contact.certificate_der, ContentSource::empty())
+        proto::link::connect(&addresses, &certificate_der, identity.as_ref(), ContentSource::empty())
             .await
             .map_err(|error| error.to_string())?;
     link.sender.fetch(content).await.map_err(|error| error.to_string())
@@ -50,9 +65,10 @@ async fn read(
     link: LinkId,
     sender: LinkSender<NodeToApp>,
     mut receiver: LinkReceiver<AppToNode>,
+    peer: Option<Principal>,
     inputs: mpsc::Sender<Input>,
 ) {
-    if inputs.send(Input::LinkOpened { link, sender }).await.is_err() {
+    if inputs.send(Input::LinkOpened { link, sender, peer }).await.is_err() {
         return;
     }
     loop {
@@ -78,6 +94,8 @@ type Backlog = Mutex<Option<VecDeque<(NodeToApp, Vec<Bytes>)>>>;
 #[derive(Debug)]
 pub(crate) struct Outbox {
     sender: LinkSender<NodeToApp>,
+    /// Who is at the other end, in a secured farm.
+    peer: Option<Principal>,
     /// `Some` while frames wait. A lock, not messages: the forwarder must end and the owner must see that it ended in
     /// one step, or a frame could be left behind. Held for a push or a pop. At most one result of each job held
     /// waits here (`MAX_JOBS`).
@@ -85,8 +103,13 @@ pub(crate) struct Outbox {
 }
 
 impl Outbox {
-    pub(crate) fn new(sender: LinkSender<NodeToApp>) -> Self {
-        Self { sender, backlog: Arc::new(Mutex::new(None)) }
+    pub(crate) fn new(sender: LinkSender<NodeToApp>, peer: Option<Principal>) -> Self {
+        Self { sender, peer, backlog: Arc::new(Mutex::new(None)) }
+    }
+
+    /// Who is at the other end, in a secured farm.
+    pub(crate) const fn peer(&self) -> Option<&Principal> {
+        self.peer.as_ref()
     }
 
     /// The link, for fetching.

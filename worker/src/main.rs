@@ -19,6 +19,8 @@ const EXIT_FAILED: u8 = 1;
 const EXIT_USAGE: u8 = 2;
 /// The coordinator could not be reached at the start.
 const EXIT_UNREACHABLE: u8 = 3;
+/// The farm does not let this node in.
+const EXIT_DENIED: u8 = 4;
 
 fn main() -> ExitCode {
     // clap exits with 2 by itself.
@@ -50,6 +52,7 @@ fn exit_code(error: &anyhow::Error) -> u8 {
     match error.downcast_ref() {
         Some(StartError::Unreachable(SessionError::Address { .. }, _) | StartError::NoDevice) => EXIT_USAGE,
         Some(StartError::Unreachable(..)) => EXIT_UNREACHABLE,
+        Some(StartError::Denied { .. }) => EXIT_DENIED,
         Some(
             StartError::Device(_)
             | StartError::Listen(_)
@@ -66,11 +69,11 @@ async fn run(options: WorkerOptions) -> anyhow::Result<()> {
     // Before anything is started: a signal during the start is not lost.
     let mut interrupt = signal(SignalKind::interrupt()).context("cannot listen for SIGINT")?;
     let mut terminate = signal(SignalKind::terminate()).context("cannot listen for SIGTERM")?;
-    if !options.listen.ip().is_loopback() {
+    if options.identity.is_none() && !options.listen.ip().is_loopback() {
         tracing::warn!(
             address = %options.listen,
             "listening beyond this machine WITHOUT authentication: whoever reaches this address can run kernels on this \
-             machine's devices; do so only on a network you trust"
+             machine's devices; do so only on a network you trust, or secure the farm with `farmctl init`"
         );
     }
     let mut handle = tokio::select! {
@@ -99,6 +102,7 @@ async fn drained(handle: &mut WorkerHandle) -> End {
 fn outcome(end: End) -> anyhow::Result<()> {
     match end {
         End::Drained => Ok(()),
+        End::Denied { reason } => anyhow::bail!("denied: {reason}"),
         End::Refused { reason } => anyhow::bail!("the coordinator refused this node: {reason}"),
         End::Failed { reason } => anyhow::bail!("{reason}"),
     }

@@ -1,10 +1,13 @@
 //! The connection to the coordinator: made at the start within a bounded time, and made again, for as long as the worker
 //! lives, with a bounded pause between tries.
 
-use std::time::Duration;
+use std::time::{Duration, SystemTime};
 
 use farm_core::message::{CoordinatorToNode, NodeToCoordinator};
-use proto::control::{Session, SessionError, SessionReceiver, connect_node};
+use proto::{
+    control::{Session, SessionError, SessionReceiver, connect_node, renew},
+    trust::Identity,
+};
 use tokio::{
     sync::mpsc,
     time::{Instant, sleep, sleep_until},
@@ -19,17 +22,25 @@ pub(crate) type NodeLink = Session<NodeToCoordinator, CoordinatorToNode>;
 const FIRST_PAUSE: Duration = Duration::from_millis(100);
 /// Longest pause between tries.
 const LONGEST_PAUSE: Duration = Duration::from_secs(2);
+/// How often the node looks whether its certificate is to be renewed.
+const RENEWAL_CHECK: Duration = Duration::from_secs(3_600);
 
 /// Connects at the start, trying for at most `timeout`.
-pub(crate) async fn first(coordinator: &str, timeout: Duration) -> Result<NodeLink, SessionError> {
+pub(crate) async fn first(
+    coordinator: &str,
+    identity: Option<&Identity>,
+    timeout: Duration,
+) -> Result<NodeLink, SessionError> {
     let deadline = Instant::now() + timeout;
     let mut pause = FIRST_PAUSE;
     loop {
-        let error = match connect_node(coordinator).await {
+        let error = match connect_node(coordinator, identity).await {
             Ok(session) => return Ok(session),
-            Err(error @ (SessionError::Address { .. } | SessionError::Malformed { .. })) => {
-                return Err(error);
-            }
+            Err(
+                error @ (SessionError::Address { .. }
+                | SessionError::Malformed { .. }
+                | SessionError::Denied { .. }),
+            ) => return Err(error),
             Err(error) => error,
         };
         if Instant::now() + pause >= deadline {
@@ -42,19 +53,34 @@ pub(crate) async fn first(coordinator: &str, timeout: Duration) -> Result<NodeLi
 }
 
 /// Connects again, however long it takes; gives the session to the driver.
-pub(crate) async fn again(coordinator: String, inputs: mpsc::Sender<Input>) {
+pub(crate) async fn again(coordinator: String, identity: Option<Identity>, inputs: mpsc::Sender<Input>) {
     let mut pause = FIRST_PAUSE;
     loop {
         sleep(pause).await;
-        match connect_node(&coordinator).await {
+        match connect_node(&coordinator, identity.as_ref()).await {
             Ok(session) => {
                 // Without a driver the worker has ended, and the session with it.
                 let _ = inputs.send(Input::Connected(session)).await;
                 return;
             }
+            Err(error @ SessionError::Denied { .. }) => tracing::warn!(%error, "trying again"),
             Err(error) => tracing::debug!(%error, "trying again"),
         }
         pause = (pause * 2).min(LONGEST_PAUSE);
+    }
+}
+
+/// Renews the node's certificate in time, for as long as it is polled.
+pub(crate) async fn stay_valid(coordinator: String, identity: Identity) {
+    loop {
+        sleep(RENEWAL_CHECK).await;
+        if SystemTime::now() < identity.renew_at() {
+            continue;
+        }
+        match renew(&coordinator, &identity).await {
+            Ok(()) => tracing::info!("the node's certificate is renewed"),
+            Err(error) => tracing::warn!(%error, "the node's certificate could not be renewed, trying again"),
+        }
     }
 }
 

@@ -11,6 +11,7 @@ use anyhow::{Context as _, bail, ensure};
 use clap::Parser;
 use farm_core::worker::Share;
 use gpu_exec::DeviceSpec;
+use proto::trust::{Identity, Role, default_identity};
 use serde::Deserialize;
 use worker::WorkerOptions;
 
@@ -51,13 +52,17 @@ pub(crate) struct Arguments {
     /// [default: all].
     #[arg(long, value_name = "SPEC", env = "GLEANER_DEVICE", value_delimiter = ';')]
     device: Vec<String>,
+    /// Who this node is in a secured farm: what `farmctl join` has written
+    /// [default: ~/.config/gleaner/node.pem, if there is one].
+    #[arg(long, value_name = "FILE", env = "GLEANER_IDENTITY")]
+    identity: Option<PathBuf>,
     /// Folder for caches.
     #[arg(long, value_name = "DIR", env = "GLEANER_CACHE")]
     cache: Option<PathBuf>,
     /// How long the coordinator is tried at the start, as 500ms, 30s, 5m or 1h [default: 30s].
     #[arg(long, value_name = "DURATION", env = "GLEANER_CONNECT_TIMEOUT")]
     connect_timeout: Option<String>,
-    /// Say that plain text is meant: refuses to listen on anything but loopback.
+    /// Serve a farm that is not secured, whatever identity there is: refuses to listen on anything but loopback.
     #[arg(
         long,
         env = "GLEANER_INSECURE",
@@ -80,6 +85,7 @@ struct ConfigFile {
     name: Option<String>,
     #[serde(default)]
     device: Vec<String>,
+    identity: Option<PathBuf>,
     cache: Option<PathBuf>,
     connect_timeout: Option<String>,
     insecure: Option<bool>,
@@ -133,7 +139,8 @@ pub(crate) fn options(arguments: Arguments) -> anyhow::Result<WorkerOptions> {
     check_host_port("coordinator", &coordinator)?;
     let defaults = WorkerOptions::embedded(coordinator, Vec::new());
     let listen = address(arguments.listen.or(file.listen), defaults.listen)?;
-    if arguments.insecure.or(file.insecure).unwrap_or(false) {
+    let insecure = arguments.insecure.or(file.insecure).unwrap_or(false);
+    if insecure {
         ensure!(
             listen.ip().is_loopback(),
             "--insecure allows loopback only, but listen is {listen}; listen on 127.0.0.1, or leave --insecure out on a \
@@ -147,10 +154,12 @@ pub(crate) fn options(arguments: Arguments) -> anyhow::Result<WorkerOptions> {
         !(advertise.is_empty() && listen.ip().is_unspecified()),
         "listen {listen} is no address that others can dial: say --advertise HOST:PORT for each that they can"
     );
+    let identity = if insecure { None } else { identity(arguments.identity.or(file.identity))? };
     Ok(WorkerOptions {
         listen,
         advertise,
-        name: name(arguments.name.or(file.name))?,
+        name: name(arguments.name.or(file.name), identity.as_ref())?,
+        identity,
         devices: devices(or_else(arguments.device, file.device))?,
         connect_timeout: duration(
             "connect_timeout",
@@ -199,8 +208,19 @@ fn check_host_port(key: &str, address: &str) -> anyhow::Result<()> {
     Ok(())
 }
 
-fn name(given: Option<String>) -> anyhow::Result<String> {
-    let Some(name) = given else {
+/// The identity in the file given, or in the usual one if it is there.
+fn identity(given: Option<PathBuf>) -> anyhow::Result<Option<Identity>> {
+    let usual = || default_identity("node").filter(|path| path.exists());
+    let Some(path) = given.or_else(usual) else { return Ok(None) };
+    let identity = Identity::read(&path).context("identity")?;
+    let role = identity.principal().role;
+    ensure!(role == Role::Node, "identity {}: is of {}, not of a node", path.display(), identity.principal());
+    Ok(Some(identity))
+}
+
+/// The name given; else the identity's, under which the node comes back as itself.
+fn name(given: Option<String>, identity: Option<&Identity>) -> anyhow::Result<String> {
+    let Some(name) = given.or_else(|| identity.map(|identity| identity.principal().name.clone())) else {
         let host = fs::read_to_string("/proc/sys/kernel/hostname").unwrap_or_default();
         let host = match host.trim() {
             "" => "worker",

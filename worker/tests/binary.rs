@@ -71,12 +71,12 @@ async fn registered_and_drained(devices: &'static [&'static str]) -> (serde_json
     });
     let running = running.await.unwrap();
     let ready = running.ready.clone();
-    let status = proto::control::status(&address).await.unwrap();
+    let status = proto::control::status(&address, None).await.unwrap();
     assert_eq!(status.nodes.len(), 1, "it is registered when it says so");
     assert_eq!(serde_json::json!(status.nodes[0].node.to_string()), ready["node"], "under its own name");
     let (code, stderr) = tokio::task::spawn_blocking(|| running.terminate()).await.unwrap();
     assert_eq!(code, Some(0), "stderr:\n{stderr}");
-    assert!(proto::control::status(&address).await.unwrap().nodes.is_empty(), "it said goodbye");
+    assert!(proto::control::status(&address, None).await.unwrap().nodes.is_empty(), "it said goodbye");
     coordinator.shutdown().await;
     (ready, stderr)
 }

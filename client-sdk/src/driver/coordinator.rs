@@ -4,7 +4,10 @@
 use std::time::{Duration, Instant};
 
 use farm_core::message::AppToCoordinator;
-use proto::control::{SessionError, SessionReceiver, SessionSender, connect_app};
+use proto::{
+    control::{SessionError, SessionReceiver, SessionSender, connect_app},
+    trust::Identity,
+};
 use tokio::sync::mpsc;
 
 use super::{AppSession, CoordinatorToApp, Input};
@@ -16,6 +19,7 @@ const LONGEST_BACK_OFF: Duration = Duration::from_secs(3);
 
 pub(super) struct Coordinator {
     address: String,
+    identity: Option<Identity>,
     reconnect_timeout: Duration,
     inputs: mpsc::Sender<Input>,
     /// Number of the newest session.
@@ -52,10 +56,11 @@ pub(super) struct GaveUp {
 impl Coordinator {
     pub(super) const fn new(
         address: String,
+        identity: Option<Identity>,
         reconnect_timeout: Duration,
         inputs: mpsc::Sender<Input>,
     ) -> Self {
-        Self { address, reconnect_timeout, inputs, serial: 0, state: State::Trying, loss: None }
+        Self { address, identity, reconnect_timeout, inputs, serial: 0, state: State::Trying, loss: None }
     }
 
     pub(super) const fn is_current(&self, serial: u64) -> bool {
@@ -129,9 +134,10 @@ impl Coordinator {
         }
         if matches!(self.state, State::BackingOff { until } if until <= now) {
             self.state = State::Trying;
-            let (address, inputs) = (self.address.clone(), self.inputs.clone());
+            let (address, identity) = (self.address.clone(), self.identity.clone());
+            let inputs = self.inputs.clone();
             tokio::spawn(async move {
-                let outcome = connect_app(&address).await;
+                let outcome = connect_app(&address, identity.as_ref()).await;
                 // Without an owner task nobody wants the session.
                 let _ = inputs.send(Input::CoordinatorTried(outcome)).await;
             });
@@ -172,7 +178,7 @@ mod tests {
     #[test]
     fn tries_get_rarer_and_end() {
         let (inputs, _receiver) = mpsc::channel(1);
-        let mut coordinator = Coordinator::new("nowhere:1".to_owned(), Duration::from_secs(30), inputs);
+        let mut coordinator = Coordinator::new("nowhere:1".to_owned(), None, Duration::from_secs(30), inputs);
         let start = Instant::now();
         let gone = SessionError::Ended { reason: "gone".to_owned() };
         let mut pauses = Vec::new();

@@ -14,6 +14,7 @@ use farm_core::{
 use proto::{
     codec::{content_hash, pack_programs},
     link::{ContentSource, Frame, Link, LinkReceiver, LinkSender, TrySendError, connect},
+    trust::Identity,
 };
 use tokio::{
     sync::{OwnedSemaphorePermit, Semaphore, mpsc},
@@ -57,6 +58,9 @@ pub(super) struct Links {
     inputs: mpsc::Sender<Input>,
     contents: ContentSource,
     results: ResultRoom,
+    identity: Option<Identity>,
+    /// What nodes of a secured farm are shown with the hello.
+    capability: Bytes,
 }
 
 struct NodeLink {
@@ -78,14 +82,25 @@ struct ResultRoom {
 }
 
 impl Links {
-    pub(super) fn new(inputs: mpsc::Sender<Input>, contents: ContentSource, result_bytes: usize) -> Self {
+    pub(super) fn new(
+        inputs: mpsc::Sender<Input>,
+        contents: ContentSource,
+        result_bytes: usize,
+        identity: Option<Identity>,
+    ) -> Self {
         let most = Semaphore::MAX_PERMITS.min(u32::MAX as usize);
         let all = (result_bytes / PERMIT_BYTES).clamp(1, most);
         let results = ResultRoom {
             permits: Arc::new(Semaphore::new(all)),
             all: u32::try_from(all).expect("clamped to what a u32 holds"),
         };
-        Self { links: BTreeMap::new(), next_serial: 0, inputs, contents, results }
+        let links = BTreeMap::new();
+        Self { links, next_serial: 0, inputs, contents, results, identity, capability: Bytes::new() }
+    }
+
+    /// From now on nodes are shown this.
+    pub(super) fn show(&mut self, capability: Vec<u8>) {
+        self.capability = capability.into();
     }
 
     /// Links that stand.
@@ -103,7 +118,8 @@ impl Links {
         let serial = self.next_serial;
         self.next_serial += 1;
         let key = LinkKey { node, session, serial };
-        let task = run_link(key, contact, self.contents.clone(), self.results.clone(), self.inputs.clone());
+        let link = NewLink { key, contact, identity: self.identity.clone(), contents: self.contents.clone() };
+        let task = run_link(link, self.results.clone(), self.inputs.clone());
         let state = State::Connecting(tokio::spawn(task).abort_handle());
         self.links.insert((node, session), NodeLink { serial, state });
     }
@@ -155,9 +171,8 @@ impl Links {
         };
         match message {
             AppToNode::Jobs(tickets) => send_jobs(sender, tickets, programs),
-            AppToNode::Hello { .. } | AppToNode::Acks(_) | AppToNode::Cancel(_) => {
-                send_frame(sender, message, Vec::new())
-            }
+            AppToNode::Hello { .. } => send_frame(sender, message, vec![self.capability.clone()]),
+            AppToNode::Acks(_) | AppToNode::Cancel(_) => send_frame(sender, message, Vec::new()),
         }
     }
 }
@@ -199,15 +214,18 @@ fn send_frame(sender: &LinkSender<AppToNode>, header: AppToNode, payload: Vec<By
     }
 }
 
-/// Dials, then passes on what the node says until the link is over.
-async fn run_link(
+/// What a link is made of.
+struct NewLink {
     key: LinkKey,
     contact: Contact,
+    identity: Option<Identity>,
     contents: ContentSource,
-    room: ResultRoom,
-    inputs: mpsc::Sender<Input>,
-) {
-    let reason = match connect(&contact.addresses, &contact.certificate_der, contents).await {
+}
+
+/// Dials, then passes on what the node says until the link is over.
+async fn run_link(link: NewLink, room: ResultRoom, inputs: mpsc::Sender<Input>) {
+    let NewLink { key, contact: Contact { addresses, certificate_der }, identity, contents } = link;
+    let reason = match connect(&addresses, &certificate_der, identity.as_ref(), contents).await {
         Ok(Link { sender, receiver }) => {
             if inputs.send(Input::NodeConnected { key, sender: sender.clone() }).await.is_err() {
                 return;
@@ -357,7 +375,7 @@ mod tests {
     #[tokio::test]
     async fn room_is_bounded_and_given_back() {
         let (inputs, _receiver) = mpsc::channel(1);
-        let room = Links::new(inputs, ContentSource::empty(), 4 << 10).results;
+        let room = Links::new(inputs, ContentSource::empty(), 4 << 10, None).results;
         assert!(matches!(room.try_take(0), Some(None)));
         let first = room.try_take(3 << 10).expect("the room is empty");
         assert!(room.try_take(2 << 10).is_none(), "1 KiB is left");

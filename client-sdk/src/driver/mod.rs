@@ -186,8 +186,14 @@ pub(crate) async fn drive(setup: DriverSetup) {
         policy: options.policy.clone(),
         resume: None,
     };
-    let links = Links::new(handle.inputs.clone(), contents, options.window.result_bytes);
-    let coordinator = Coordinator::new(options.coordinator.clone(), options.reconnect_timeout, handle.inputs);
+    let links =
+        Links::new(handle.inputs.clone(), contents, options.window.result_bytes, options.identity.clone());
+    let coordinator = Coordinator::new(
+        options.coordinator.clone(),
+        options.identity.clone(),
+        options.reconnect_timeout,
+        handle.inputs,
+    );
     let mut driver = Driver {
         ledger: Ledger::new(hello),
         origin: Instant::now(),
@@ -306,6 +312,10 @@ impl Driver {
     }
 
     fn coordinator_said(&mut self, message: CoordinatorToApp) {
+        if let CoordinatorToApp::Capability(bytes) = message {
+            self.links.show(bytes);
+            return;
+        }
         match &message {
             CoordinatorToApp::Welcome { app, .. } => {
                 tracing::debug!(%app, "registered");
@@ -316,7 +326,8 @@ impl Driver {
             CoordinatorToApp::Refused { .. }
             | CoordinatorToApp::Waiting { .. }
             | CoordinatorToApp::JobFailed { .. }
-            | CoordinatorToApp::HeartbeatAck { .. } => {}
+            | CoordinatorToApp::HeartbeatAck { .. }
+            | CoordinatorToApp::Capability(_) => {}
         }
         self.tell_ledger(Event::FromCoordinator(message));
     }
@@ -324,7 +335,10 @@ impl Driver {
     fn coordinator_lost(&mut self, error: SessionError) {
         tracing::warn!(%error, "the coordinator is lost, trying again");
         let address = self.options.coordinator.clone();
-        self.answer_registration(Err(FarmError::Unreachable { address, reason: error.to_string() }));
+        self.answer_registration(Err(match &error {
+            SessionError::Denied { reason } => FarmError::Denied { address, reason: reason.clone() },
+            error => FarmError::Unreachable { address, reason: error.to_string() },
+        }));
         self.coordinator.lost(&error, Instant::now());
         self.tell_ledger(Event::CoordinatorLost);
     }

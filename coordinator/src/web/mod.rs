@@ -13,8 +13,8 @@ use axum::{
     routing::get,
 };
 use farm_core::coordinator::FarmStatus;
-use proto::control::Incoming;
-use tokio::net::{TcpListener, TcpStream};
+use proto::control::{ControlStream, Incoming};
+use tokio::net::TcpListener;
 
 use crate::owner::OwnerHandle;
 
@@ -32,10 +32,10 @@ impl Listener {
 }
 
 impl axum::serve::Listener for Listener {
-    type Io = TcpStream;
+    type Io = ControlStream;
     type Addr = SocketAddr;
 
-    async fn accept(&mut self) -> (TcpStream, SocketAddr) {
+    async fn accept(&mut self) -> (ControlStream, SocketAddr) {
         match self.incoming.accept().await {
             Some(accepted) => accepted,
             // The accepting task lives as long as this: only a runtime that ends takes it away.

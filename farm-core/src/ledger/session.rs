@@ -96,7 +96,7 @@ impl Ledger {
                 }
             }
             CoordinatorToApp::JobFailed { job, failure } => self.given_up(job, failure),
-            CoordinatorToApp::HeartbeatAck { sequence: _ } => {}
+            CoordinatorToApp::HeartbeatAck { sequence: _ } | CoordinatorToApp::Capability(_) => {}
         }
     }
 

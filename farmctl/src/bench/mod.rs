@@ -23,6 +23,7 @@ use crate::{
     output,
     process_farm::{ProcessFarm, Shape, Stealing},
     running::Stops,
+    target::Reach,
 };
 
 /// Longest wait until a farm has heard of the end of all its jobs: nodes report within 5 ms.
@@ -135,7 +136,7 @@ async fn connect(farm: &ProcessFarm, name: &str, weight: f64, global: Stealing) 
 /// Waits until the coordinator has no job on its books: what is planned next starts from empty queues.
 async fn settled(farm: &ProcessFarm) -> anyhow::Result<()> {
     let quiet = async {
-        let admin = Admin::new(Some(farm.grpc()));
+        let admin = Admin::new(Reach::open(farm.grpc()));
         loop {
             let status = admin.status().await.map_err(|failure| anyhow::anyhow!(failure.describe()))?;
             if status.apps.iter().all(|app| app.outstanding_jobs == 0 && app.waiting_jobs == 0) {

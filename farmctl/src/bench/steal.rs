@@ -31,6 +31,7 @@ use crate::{
     admin::Admin,
     output,
     process_farm::{Shape, Stealing},
+    target::Reach,
     timeline::{Chart, svg},
 };
 
@@ -256,7 +257,7 @@ async fn run(
     let summary = app.run(frame()).await?;
     settled(&farm).await?;
     let query = TimelineQuery { app: None, task: None, max_segments: MAX_SEGMENTS };
-    let timeline = Admin::new(Some(farm.grpc())).timeline(query).await;
+    let timeline = Admin::new(Reach::open(farm.grpc())).timeline(query).await;
     let mut timeline = timeline.map_err(|failure| anyhow::anyhow!(failure.describe()))?;
     app.close().await;
     let last = timeline.segments.iter().map(|segment| segment.job.job.task).max();

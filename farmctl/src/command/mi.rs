@@ -25,6 +25,7 @@ use crate::{
     output::{moved, print_text},
     progress::{Early, Units},
     running::{Stops, run_graph},
+    target::Target,
 };
 
 /// Raw sums in the folder: what `--extend` goes on from.
@@ -47,7 +48,7 @@ struct Input {
 }
 
 /// Computes; the exit code is 0 only when every iteration is in the results.
-pub(crate) async fn run(arguments: &MiArgs, coordinator: Option<&str>) -> Result<(), Failure> {
+pub(crate) async fn run(arguments: &MiArgs, target: &Target<'_>) -> Result<(), Failure> {
     let mut stops = Stops::listen()?;
     let reading = arguments.clone();
     // Reading ends by itself, or with the process.
@@ -68,15 +69,10 @@ pub(crate) async fn run(arguments: &MiArgs, coordinator: Option<&str>) -> Result
     let before = input.earlier.as_ref().map_or(0, Accumulators::iterations);
     let (graph, handle) =
         mi_graph(Arc::clone(&input.alignment), options).with_context(|| shown(&arguments.alignment))?;
-    let own_farm = match coordinator {
-        Some(_) => None,
-        None => Some(tokio::select! {
-            farm = EmbeddedFarm::start(&arguments.devices) => farm?,
-            () = stops.recv() => return Err(anyhow!("interrupted before the first job: nothing was written").into()),
-        }),
+    let (reach, own_farm) = tokio::select! {
+        farm = EmbeddedFarm::unless_named(target, &arguments.devices) => farm?,
+        () = stops.recv() => return Err(anyhow!("interrupted before the first job: nothing was written").into()),
     };
-    let address = own_farm.as_ref().map(EmbeddedFarm::grpc).or_else(|| coordinator.map(str::to_owned));
-    let address = address.expect("either a coordinator is given or the own farm was started");
     #[expect(clippy::cast_precision_loss, reason = "a rate for people")]
     let units = Units {
         jobs: handle.jobs(),
@@ -87,7 +83,7 @@ pub(crate) async fn run(arguments: &MiArgs, coordinator: Option<&str>) -> Result
     let name = arguments.alignment.file_name().unwrap_or(arguments.alignment.as_os_str());
     let farm = FarmOptions {
         policy: arguments.policy.clone(),
-        ..FarmOptions::new(&address, format!("mi {}", name.to_string_lossy()))
+        ..reach.options(format!("mi {}", name.to_string_lossy()))
     };
     let result = run_graph(farm, graph, arguments.progress, units, &mut stops).await;
     let ended = finish(result, &input, &handle, arguments, before).await;
@@ -194,10 +190,7 @@ async fn finish(
 ) -> Result<(), Failure> {
     let (summary, failure) = match result {
         Ok(summary) => (summary, None),
-        Err(error @ (FarmError::Unreachable { .. } | FarmError::CoordinatorLost { .. })) => {
-            (RunSummary::default(), Some(Failure::Unreachable(error.into())))
-        }
-        Err(error) => (RunSummary::default(), Some(Failure::Work(error.into()))),
+        Err(error) => (RunSummary::default(), Some(Failure::of_run(error))),
     };
     let done = handle.iterations_done();
     let Some(observed) = handle.observed().filter(|_| failure.is_none() || done > before) else {

@@ -1,10 +1,10 @@
 //! `farmctl node ...`: looking after nodes.
 
-use crate::{admin::Admin, cli::NodeVerb, failure::Failure, output};
+use crate::{admin::Admin, cli::NodeVerb, failure::Failure, output, target::Target};
 
 /// Runs one of the verbs.
-pub(crate) async fn run(verb: &NodeVerb, coordinator: Option<&str>) -> Result<(), Failure> {
-    let admin = Admin::new(coordinator);
+pub(crate) async fn run(verb: &NodeVerb, target: &Target<'_>) -> Result<(), Failure> {
+    let admin = Admin::new(target.existing().await?);
     match verb {
         NodeVerb::Drain { node } => {
             let status = admin.status().await?;

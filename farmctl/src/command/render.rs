@@ -9,7 +9,7 @@ use bdpt_kernel::{
     output::{self, Tone},
     scene::{self, LoadedScene, model::FilmSize},
 };
-use client_sdk::{FarmError, FarmOptions, RunSummary};
+use client_sdk::{FarmError, RunSummary};
 use serde_json::json;
 
 use crate::{
@@ -19,13 +19,14 @@ use crate::{
     output::{moved, print_text},
     progress::Units,
     running::{Stops, run_graph},
+    target::Target,
 };
 
 /// How long jobs may wait for a device of the own farm: its worker was registered before.
 const OWN_FARM_PATIENCE: Duration = Duration::from_secs(2);
 
 /// Renders; the exit code is 0 only when every image is complete.
-pub(crate) async fn run(arguments: &RenderArgs, coordinator: Option<&str>) -> Result<(), Failure> {
+pub(crate) async fn run(arguments: &RenderArgs, target: &Target<'_>) -> Result<(), Failure> {
     let mut stops = Stops::listen()?;
     for image in &arguments.images {
         output::check_writable(image)?;
@@ -43,15 +44,10 @@ pub(crate) async fn run(arguments: &RenderArgs, coordinator: Option<&str>) -> Re
     let (graph, render) =
         render_graph(loaded.scene, RenderOptions::new(size, arguments.spp, arguments.seed))?;
 
-    let own_farm = match coordinator {
-        Some(_) => None,
-        None => Some(tokio::select! {
-            farm = EmbeddedFarm::start(&arguments.devices) => farm?,
-            () = stops.recv() => return Err(anyhow!("interrupted before rendering: no image was written").into()),
-        }),
+    let (reach, own_farm) = tokio::select! {
+        farm = EmbeddedFarm::unless_named(target, &arguments.devices) => farm?,
+        () = stops.recv() => return Err(anyhow!("interrupted before rendering: no image was written").into()),
     };
-    let address = own_farm.as_ref().map(EmbeddedFarm::grpc).or_else(|| coordinator.map(str::to_owned));
-    let address = address.expect("either a coordinator is given or the own farm was started");
     let plan = render.plan();
     #[expect(clippy::cast_precision_loss, reason = "a rate for people")]
     let units = Units {
@@ -60,7 +56,7 @@ pub(crate) async fn run(arguments: &RenderArgs, coordinator: Option<&str>) -> Re
         name: "samples",
         early: None,
     };
-    let mut farm = FarmOptions::new(&address, app_name(&arguments.scene));
+    let mut farm = reach.options(app_name(&arguments.scene));
     farm.policy.clone_from(&arguments.policy);
     if own_farm.is_some() {
         // Nobody else will join: a device that does not fit now never will.
@@ -98,13 +94,9 @@ async fn finish(
             write_images(render.image(), arguments).await?;
             tell_summary(&summary, render, arguments)
         }
-        Err(error @ (FarmError::Unreachable { .. } | FarmError::CoordinatorLost { .. })) => {
-            save_partial(render, arguments).await?;
-            Err(Failure::Unreachable(error.into()))
-        }
         Err(error) => {
             save_partial(render, arguments).await?;
-            Err(Failure::Work(error.into()))
+            Err(Failure::of_run(error))
         }
     }
 }

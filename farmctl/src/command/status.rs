@@ -9,15 +9,12 @@ use crate::{
     cli::{Format, StatusArgs},
     failure::Failure,
     output::{self, printable},
+    target::Target,
 };
 
 /// Prints the status once, or again and again.
-pub(crate) async fn run(
-    arguments: &StatusArgs,
-    coordinator: Option<&str>,
-    format: Format,
-) -> Result<(), Failure> {
-    let admin = Admin::new(coordinator);
+pub(crate) async fn run(arguments: &StatusArgs, target: &Target<'_>, format: Format) -> Result<(), Failure> {
+    let admin = Admin::new(target.existing().await?);
     let format = arguments.output.unwrap_or(format);
     loop {
         let status = admin.status().await?;

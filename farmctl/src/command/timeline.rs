@@ -11,16 +11,17 @@ use crate::{
     cli::{Format, TimelineArgs, TimelineFormat},
     failure::Failure,
     output::{self, printable},
+    target::Target,
     timeline::{Chart, perfetto, summary, svg},
 };
 
 /// Asks, draws, and writes.
 pub(crate) async fn run(
     arguments: &TimelineArgs,
-    coordinator: Option<&str>,
+    target: &Target<'_>,
     format: Format,
 ) -> Result<(), Failure> {
-    let admin = Admin::new(coordinator);
+    let admin = Admin::new(target.existing().await?);
     let everything = TimelineQuery { app: None, task: None, max_segments: 0 };
     let head = admin.timeline(everything).await?.head;
     let (app, task) = choose(&arguments.task, &head)?;

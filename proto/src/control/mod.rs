@@ -5,7 +5,9 @@
 mod convert;
 mod incoming;
 mod session;
+mod stream;
 mod transport;
+mod trust;
 
 #[allow(
     missing_docs,
@@ -33,5 +35,9 @@ pub use self::{
         Heard, QUEUED_MESSAGES, Session, SessionError, SessionReceiver, SessionSender, connect_app,
         connect_node, drain, status, timeline,
     },
-    transport::{ADMIN_TIMEOUT, MAX_MESSAGE_BYTES, admin_server, apps_server, nodes_server, server},
+    stream::{Caller, ControlStream},
+    transport::{
+        ADMIN_TIMEOUT, MAX_MESSAGE_BYTES, admin_server, apps_server, nodes_server, server, trust_server,
+    },
+    trust::{Invitation, create_token, expel, join, list_members, list_tokens, renew, revoke_token},
 };

@@ -1,6 +1,6 @@
 //! The client's end of a control session, and the operator's requests.
 
-use std::{error::Error, fmt};
+use std::fmt;
 
 use farm_core::{
     coordinator::{
@@ -19,6 +19,7 @@ use super::{
     ADMIN_TIMEOUT, MAX_MESSAGE_BYTES, WireError, transport,
     v1::{self, admin_client::AdminClient, apps_client::AppsClient, nodes_client::NodesClient},
 };
+use crate::{tls, trust::Identity};
 
 /// Messages that wait to be sent on a session, at most.
 pub const QUEUED_MESSAGES: usize = 1_024;
@@ -54,6 +55,12 @@ pub enum SessionError {
     /// The request was refused (an unknown node, say). Not to be retried.
     #[error("refused by the coordinator: {reason}")]
     Refused {
+        /// Why.
+        reason: String,
+    },
+    /// The farm does not let this caller in, or is not the caller's. Not to be retried.
+    #[error("denied: {reason}")]
+    Denied {
         /// Why.
         reason: String,
     },
@@ -138,19 +145,27 @@ impl<R: Heard> SessionReceiver<R> {
         match self.0.message().await {
             Ok(Some(message)) => Ok(R::try_from(message)?),
             Ok(None) => Err(SessionError::Ended { reason: "closed by the coordinator".to_owned() }),
+            Err(status) if is_denial(&status) => {
+                Err(SessionError::Denied { reason: status.message().to_owned() })
+            }
             Err(status) => Err(SessionError::Ended { reason: words(&status) }),
         }
     }
 }
 
-/// Opens an application's session with the coordinator at `HOST:PORT`. The hello is the caller's first message.
+fn is_denial(status: &Status) -> bool {
+    matches!(status.code(), Code::Unauthenticated | Code::PermissionDenied)
+}
+
+/// Opens an application's session with the coordinator at `HOST:PORT`, as a member of a secured farm if an identity is given. The hello is the caller's first message.
 ///
 /// # Errors
 /// Nobody answers within [`ADMIN_TIMEOUT`].
 pub async fn connect_app(
     coordinator: &str,
+    identity: Option<&Identity>,
 ) -> Result<Session<AppToCoordinator, CoordinatorToApp>, SessionError> {
-    let mut client = AppsClient::new(channel(coordinator).await?)
+    let mut client = AppsClient::new(channel(coordinator, identity).await?)
         .max_decoding_message_size(MAX_MESSAGE_BYTES)
         .max_encoding_message_size(MAX_MESSAGE_BYTES);
     let (sender, queue) = mpsc::channel(QUEUED_MESSAGES);
@@ -165,8 +180,9 @@ pub async fn connect_app(
 /// Nobody answers within [`ADMIN_TIMEOUT`].
 pub async fn connect_node(
     coordinator: &str,
+    identity: Option<&Identity>,
 ) -> Result<Session<NodeToCoordinator, CoordinatorToNode>, SessionError> {
-    let mut client = NodesClient::new(channel(coordinator).await?)
+    let mut client = NodesClient::new(channel(coordinator, identity).await?)
         .max_decoding_message_size(MAX_MESSAGE_BYTES)
         .max_encoding_message_size(MAX_MESSAGE_BYTES);
     let (sender, queue) = mpsc::channel(QUEUED_MESSAGES);
@@ -179,8 +195,8 @@ pub async fn connect_node(
 ///
 /// # Errors
 /// Nobody answers within [`ADMIN_TIMEOUT`].
-pub async fn status(coordinator: &str) -> Result<FarmStatus, SessionError> {
-    let mut client = admin(coordinator).await?;
+pub async fn status(coordinator: &str, identity: Option<&Identity>) -> Result<FarmStatus, SessionError> {
+    let mut client = admin(coordinator, identity).await?;
     let answer = within_timeout(coordinator, client.status(Request::new(v1::StatusRequest {}))).await?;
     Ok(answer.into_inner().try_into()?)
 }
@@ -189,8 +205,8 @@ pub async fn status(coordinator: &str) -> Result<FarmStatus, SessionError> {
 ///
 /// # Errors
 /// Nobody answers, or the node is unknown.
-pub async fn drain(coordinator: &str, node: NodeId) -> Result<(), SessionError> {
-    let mut client = admin(coordinator).await?;
+pub async fn drain(coordinator: &str, identity: Option<&Identity>, node: NodeId) -> Result<(), SessionError> {
+    let mut client = admin(coordinator, identity).await?;
     within_timeout(coordinator, client.drain(Request::new(v1::DrainRequest { node: node.0 }))).await?;
     Ok(())
 }
@@ -199,8 +215,12 @@ pub async fn drain(coordinator: &str, node: NodeId) -> Result<(), SessionError> 
 ///
 /// # Errors
 /// Nobody answers, the answer breaks off, or it is more than the record can hold.
-pub async fn timeline(coordinator: &str, query: TimelineQuery) -> Result<Timeline, SessionError> {
-    let mut client = admin(coordinator).await?;
+pub async fn timeline(
+    coordinator: &str,
+    identity: Option<&Identity>,
+    query: TimelineQuery,
+) -> Result<Timeline, SessionError> {
+    let mut client = admin(coordinator, identity).await?;
     let request = Request::new(v1::TimelineRequest::from(query));
     let mut parts = within_timeout(coordinator, client.timeline(request)).await?.into_inner();
     let mut timeline = Timeline::default();
@@ -223,20 +243,28 @@ pub async fn timeline(coordinator: &str, query: TimelineQuery) -> Result<Timelin
     if headed { Ok(timeline) } else { Err(WireError::Missing { field: "TimelinePart.head" }.into()) }
 }
 
-async fn admin(coordinator: &str) -> Result<AdminClient<Channel>, SessionError> {
-    Ok(AdminClient::new(channel(coordinator).await?)
+async fn admin(coordinator: &str, identity: Option<&Identity>) -> Result<AdminClient<Channel>, SessionError> {
+    Ok(AdminClient::new(channel(coordinator, identity).await?)
         .max_decoding_message_size(MAX_MESSAGE_BYTES)
         .max_encoding_message_size(MAX_MESSAGE_BYTES))
 }
 
-async fn channel(coordinator: &str) -> Result<Channel, SessionError> {
-    transport::endpoint(coordinator)?.connect().await.map_err(|error| SessionError::Unreachable {
-        address: coordinator.to_owned(),
-        reason: root_cause(&error),
-    })
+/// A connection as a member, or in plain text.
+pub(super) async fn channel(coordinator: &str, identity: Option<&Identity>) -> Result<Channel, SessionError> {
+    let denied = |reason: String| SessionError::Denied { reason };
+    let config = match identity {
+        Some(identity) if identity.is_over() => {
+            return Err(denied(format!("the certificate of {} is over: join again", identity.principal())));
+        }
+        Some(identity) => {
+            Some(tls::control_client_config(identity).map_err(|error| denied(error.to_string()))?)
+        }
+        None => None,
+    };
+    transport::connect(coordinator, config).await
 }
 
-async fn within_timeout<T>(
+pub(super) async fn within_timeout<T>(
     coordinator: &str,
     request: impl Future<Output = Result<T, Status>>,
 ) -> Result<T, SessionError> {
@@ -244,8 +272,13 @@ async fn within_timeout<T>(
     match tokio::time::timeout(ADMIN_TIMEOUT, request).await {
         Err(_) => Err(unreachable(format!("no answer within {ADMIN_TIMEOUT:?}"))),
         Ok(Ok(answer)) => Ok(answer),
-        Ok(Err(status)) if matches!(status.code(), Code::NotFound | Code::InvalidArgument) => {
+        Ok(Err(status))
+            if matches!(status.code(), Code::NotFound | Code::InvalidArgument | Code::FailedPrecondition) =>
+        {
             Err(SessionError::Refused { reason: status.message().to_owned() })
+        }
+        Ok(Err(status)) if is_denial(&status) => {
+            Err(SessionError::Denied { reason: status.message().to_owned() })
         }
         Ok(Err(status)) => Err(unreachable(words(&status))),
     }
@@ -253,16 +286,7 @@ async fn within_timeout<T>(
 
 fn words(status: &Status) -> String {
     match status.message() {
-        "" => root_cause(status),
+        "" => transport::root_cause(status),
         message => message.to_owned(),
     }
-}
-
-/// The innermost error says what happened ("connection refused"); the outer ones say "transport error".
-fn root_cause(error: &dyn Error) -> String {
-    let mut cause = error;
-    while let Some(source) = cause.source() {
-        cause = source;
-    }
-    cause.to_string()
 }

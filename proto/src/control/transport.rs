@@ -1,8 +1,12 @@
 //! Settings of the gRPC connections, the same at both ends.
 
-use std::time::Duration;
+use std::{error::Error, io, sync::Arc, time::Duration};
 
-use tonic::transport::{Endpoint, Server};
+use hyper_util::rt::TokioIo;
+use rustls::pki_types::ServerName;
+use tokio::net::TcpStream;
+use tokio_rustls::TlsConnector;
+use tonic::transport::{Channel, Endpoint, Server, Uri};
 
 use super::{SessionError, v1};
 
@@ -10,6 +14,10 @@ use super::{SessionError, v1};
 pub const ADMIN_TIMEOUT: Duration = Duration::from_secs(5);
 /// Most bytes of one message, in either direction.
 pub const MAX_MESSAGE_BYTES: usize = 16 << 20;
+/// Most bytes of one message to the service that strangers may speak to: a signing request has half a kilobyte.
+const MAX_TRUST_MESSAGE_BYTES: usize = 64 << 10;
+/// What clients call the coordinator in the handshake.
+const COORDINATOR_NAME: &str = "gleaner-coordinator";
 /// HTTP/2 pings go this often (off by default).
 const KEEP_ALIVE: Duration = Duration::from_secs(5);
 /// A connection that does not answer a ping for this long is closed.
@@ -53,8 +61,72 @@ pub fn admin_server<A: v1::admin_server::Admin>(admin: A) -> v1::admin_server::A
         .max_encoding_message_size(MAX_MESSAGE_BYTES)
 }
 
+/// The service of members and those who become one, with message caps.
+pub fn trust_server<T: v1::trust_server::Trust>(trust: T) -> v1::trust_server::TrustServer<T> {
+    v1::trust_server::TrustServer::new(trust)
+        .max_decoding_message_size(MAX_TRUST_MESSAGE_BYTES)
+        .max_encoding_message_size(MAX_MESSAGE_BYTES)
+}
+
+/// Connects to `HOST:PORT`, under TLS if a configuration is given.
+pub(super) async fn connect(
+    coordinator: &str,
+    tls: Option<rustls::ClientConfig>,
+) -> Result<Channel, SessionError> {
+    let endpoint = endpoint(coordinator)?;
+    let connected = match tls {
+        None => endpoint.connect().await,
+        Some(config) => {
+            let connector = TlsConnector::from(Arc::new(config));
+            let address: Arc<str> = coordinator.into();
+            let dial = move |_: Uri| {
+                let (connector, address) = (connector.clone(), Arc::clone(&address));
+                async move {
+                    let stream = TcpStream::connect(&*address).await?;
+                    stream.set_nodelay(true)?;
+                    // Nobody compares it: the certificate's URI and its signature say who it is.
+                    let name = ServerName::try_from(COORDINATOR_NAME).map_err(io::Error::other)?;
+                    Ok::<_, io::Error>(TokioIo::new(connector.connect(name, stream).await?))
+                }
+            };
+            endpoint.connect_with_connector(tower::service_fn(dial)).await
+        }
+    };
+    connected.map_err(|error| refusal(coordinator, &error))
+}
+
+/// A connection that was not made: nobody is there, or who is there is not of the caller's farm.
+fn refusal(coordinator: &str, error: &(dyn Error + 'static)) -> SessionError {
+    match tls_error(error) {
+        None => SessionError::Unreachable { address: coordinator.to_owned(), reason: root_cause(error) },
+        Some(rustls::Error::InvalidCertificate(_)) => SessionError::Denied {
+            reason: format!("who answers at {coordinator} is not this farm's coordinator"),
+        },
+        Some(rustls::Error::InvalidMessage(_)) => SessionError::Denied {
+            reason: format!("the farm at {coordinator} is not secured; --insecure says that it is meant"),
+        },
+        Some(error) => SessionError::Denied { reason: error.to_string() },
+    }
+}
+
+/// What TLS says among an error's causes.
+fn tls_error<'error>(error: &'error (dyn Error + 'static)) -> Option<&'error rustls::Error> {
+    let within = error.downcast_ref::<io::Error>().and_then(io::Error::get_ref);
+    let tls = error.downcast_ref().or_else(|| within?.downcast_ref());
+    tls.or_else(|| tls_error(error.source()?))
+}
+
+/// The innermost error says what happened ("connection refused"); the outer ones say "transport error".
+pub(super) fn root_cause(error: &dyn Error) -> String {
+    let mut cause = error;
+    while let Some(source) = cause.source() {
+        cause = source;
+    }
+    cause.to_string()
+}
+
 /// The client's end of a connection to `HOST:PORT`.
-pub(super) fn endpoint(coordinator: &str) -> Result<Endpoint, SessionError> {
+fn endpoint(coordinator: &str) -> Result<Endpoint, SessionError> {
     let bad =
         |reason: &str| SessionError::Address { address: coordinator.to_owned(), reason: reason.to_owned() };
     let (host, port) = coordinator.rsplit_once(':').ok_or_else(|| bad("the port is missing"))?;

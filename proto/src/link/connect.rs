@@ -12,6 +12,7 @@ use quinn::{
     ClientConfig, Connection, Endpoint, EndpointConfig, IdleTimeout, MtuDiscoveryConfig, ServerConfig,
     TokioRuntime, TransportConfig, VarInt,
 };
+use rustls::pki_types::CertificateDer;
 use socket2::{Domain, Protocol, Socket, Type};
 use thiserror::Error;
 use tokio::task::JoinSet;
@@ -20,7 +21,10 @@ use super::{
     BULK_STREAMS, ContentSource, FETCH_STREAMS, Header, Link, LinkError, LinkReceiver, LinkSender, fetch,
     shared::{Guard, Shared},
 };
-use crate::tls::{self, NodeCertificate, TlsError};
+use crate::{
+    tls::{self, NodeCertificate, TlsError},
+    trust::{Identity, Principal},
+};
 
 /// How long `connect` tries in all, and how long an accepted handshake may take.
 pub const CONNECT_TIMEOUT: Duration = Duration::from_secs(5);
@@ -91,13 +95,14 @@ pub struct DataServer {
 }
 
 impl DataServer {
-    /// Listens on a UDP address (port 0: the system chooses) under a fresh certificate. Needs a tokio runtime.
+    /// Listens on a UDP address (port 0: the system chooses) under a fresh certificate; with an identity, for members of its
+    /// farm alone. Needs a tokio runtime.
     ///
     /// # Errors
     /// The address cannot be had, or no certificate can be made.
-    pub fn bind(address: SocketAddr) -> Result<Self, BindError> {
+    pub fn bind(address: SocketAddr, identity: Option<&Identity>) -> Result<Self, BindError> {
         let certificate = NodeCertificate::generate()?;
-        let mut config = ServerConfig::with_crypto(Arc::new(certificate.server_config()?));
+        let mut config = ServerConfig::with_crypto(Arc::new(certificate.server_config(identity)?));
         config.transport_config(Arc::new(transport_config())).max_incoming(MAX_INCOMING);
         let at_address = |source| BindError::Address { address, source };
         let endpoint = endpoint(address, Some(config)).map_err(at_address)?;
@@ -151,33 +156,43 @@ impl Incoming {
     }
 
     /// Completes the handshake; run it on a task of its own, for a peer may dawdle up to [`CONNECT_TIMEOUT`]. An
-    /// application that raced several addresses closes the links that lost at once.
+    /// application that raced several addresses closes the links that lost at once. `contents` says what the peer may fetch.
+    /// The link comes with who the peer is; `None` where the server asks nobody.
     ///
     /// # Errors
     /// The handshake failed.
     pub async fn establish<S: Header, R: Header>(
         self,
-        contents: ContentSource,
-    ) -> Result<Link<S, R>, LinkError> {
+        contents: impl FnOnce(Option<&Principal>) -> ContentSource,
+    ) -> Result<(Link<S, R>, Option<Principal>), LinkError> {
         let connecting = self.incoming.accept().map_err(LinkError::from)?;
         match tokio::time::timeout(CONNECT_TIMEOUT, connecting).await {
-            Ok(Ok(connection)) => Ok(open(connection, contents)),
+            Ok(Ok(connection)) => {
+                let shown = connection.peer_identity();
+                let shown =
+                    shown.as_ref().and_then(|shown| shown.downcast_ref::<Vec<CertificateDer<'static>>>());
+                let peer = tls::member(shown.map(Vec::as_slice)).map(|member| member.principal);
+                let contents = contents(peer.as_ref());
+                Ok((open(connection, contents), peer))
+            }
             Ok(Err(error)) => Err(LinkError::from(error)),
             Err(_) => Err(LinkError::Lost { reason: "the handshake took too long".to_owned() }),
         }
     }
 }
 
-/// Dials a node: all addresses (`host:port`) side by side, the first that answers with the pinned certificate wins.
+/// Dials a node: all addresses (`host:port`) side by side, the first that answers with the pinned certificate wins. Nodes of a
+/// secured farm want to see an identity.
 ///
 /// # Errors
 /// None answered within [`CONNECT_TIMEOUT`]; the error names each address and its reason.
 pub async fn connect<S: Header, R: Header>(
     addresses: &[String],
     certificate_der: &[u8],
+    identity: Option<&Identity>,
     contents: ContentSource,
 ) -> Result<Link<S, R>, ConnectError> {
-    let connection = dial(addresses, certificate_der).await?;
+    let connection = dial(addresses, certificate_der, identity).await?;
     Ok(open(connection, contents))
 }
 
@@ -196,11 +211,15 @@ enum Step {
 }
 
 /// Races all addresses for a connection.
-pub(super) async fn dial(addresses: &[String], certificate_der: &[u8]) -> Result<Connection, ConnectError> {
+pub(super) async fn dial(
+    addresses: &[String],
+    certificate_der: &[u8],
+    identity: Option<&Identity>,
+) -> Result<Connection, ConnectError> {
     if addresses.is_empty() {
         return Err(ConnectError::NoAddress);
     }
-    let mut config = ClientConfig::new(Arc::new(tls::pinned_client_config(certificate_der)?));
+    let mut config = ClientConfig::new(Arc::new(tls::pinned_client_config(certificate_der, identity)?));
     config.transport_config(Arc::new(transport_config()));
 
     let deadline = tokio::time::Instant::now() + CONNECT_TIMEOUT;

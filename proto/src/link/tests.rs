@@ -25,17 +25,17 @@ type AppLink = Link<AppToNode, NodeToApp>;
 type NodeLink = Link<NodeToApp, AppToNode>;
 
 fn server() -> DataServer {
-    DataServer::bind(SocketAddr::from(([127, 0, 0, 1], 0))).unwrap()
+    DataServer::bind(SocketAddr::from(([127, 0, 0, 1], 0)), None).unwrap()
 }
 
 /// A link over loopback, whose application offers `contents`.
 async fn linked(contents: ContentSource) -> (AppLink, NodeLink, DataServer) {
     let server = server();
     let addresses = [server.local_addr().to_string()];
-    let (app, node) = tokio::join!(connect(&addresses, server.certificate_der(), contents), async {
-        server.accept().await.unwrap().establish(ContentSource::empty()).await
+    let (app, node) = tokio::join!(connect(&addresses, server.certificate_der(), None, contents), async {
+        server.accept().await.unwrap().establish(|_| ContentSource::empty()).await
     });
-    (app.unwrap(), node.unwrap(), server)
+    (app.unwrap(), node.unwrap().0, server)
 }
 
 fn hello() -> AppToNode {
@@ -217,15 +217,15 @@ async fn another_certificate_is_refused() {
     let addresses = [server.local_addr().to_string()];
     let accepting = async {
         // The handshake fails on this side too: the peer's alert says so.
-        server.accept().await.unwrap().establish::<NodeToApp, AppToNode>(ContentSource::empty()).await
+        server.accept().await.unwrap().establish::<NodeToApp, AppToNode>(|_| ContentSource::empty()).await
     };
-    let (app, node) = tokio::join!(dial(&addresses, other.certificate_der()), accepting);
+    let (app, node) = tokio::join!(dial(&addresses, other.certificate_der(), None), accepting);
     let error = app.unwrap_err();
     assert!(matches!(error, ConnectError::Unreachable(_)), "got {error}");
     assert!(node.is_err(), "the node saw the refusal");
     // Negative control: the right certificate is accepted.
-    let (app, node) = tokio::join!(dial(&addresses, server.certificate_der()), async {
-        server.accept().await.unwrap().establish::<NodeToApp, AppToNode>(ContentSource::empty()).await
+    let (app, node) = tokio::join!(dial(&addresses, server.certificate_der(), None), async {
+        server.accept().await.unwrap().establish::<NodeToApp, AppToNode>(|_| ContentSource::empty()).await
     });
     assert!(app.is_ok() && node.is_ok(), "the pinned certificate is accepted");
 }
@@ -240,8 +240,8 @@ async fn the_race_skips_dead_and_unresolvable_addresses() {
         "no-port".to_owned(),
         format!("localhost:{}", server.local_addr().port()),
     ];
-    let (app, node) = tokio::join!(dial(&addresses, server.certificate_der()), async {
-        server.accept().await.unwrap().establish::<NodeToApp, AppToNode>(ContentSource::empty()).await
+    let (app, node) = tokio::join!(dial(&addresses, server.certificate_der(), None), async {
+        server.accept().await.unwrap().establish::<NodeToApp, AppToNode>(|_| ContentSource::empty()).await
     });
     assert!(app.is_ok() && node.is_ok(), "one address answered");
 }
@@ -249,16 +249,16 @@ async fn the_race_skips_dead_and_unresolvable_addresses() {
 #[tokio::test]
 async fn a_contact_without_a_usable_address_says_so() {
     let server = server();
-    let error = dial(&[], server.certificate_der()).await.unwrap_err();
+    let error = dial(&[], server.certificate_der(), None).await.unwrap_err();
     assert!(matches!(error, ConnectError::NoAddress), "got {error}");
-    let error = dial(&["no-port".to_owned()], server.certificate_der()).await.unwrap_err();
+    let error = dial(&["no-port".to_owned()], server.certificate_der(), None).await.unwrap_err();
     assert!(error.to_string().contains("no-port: cannot be resolved"), "got {error}");
 }
 
 #[tokio::test]
 async fn an_address_in_use_is_named() {
     let first = server();
-    let error = DataServer::bind(first.local_addr()).unwrap_err();
+    let error = DataServer::bind(first.local_addr(), None).unwrap_err();
     assert!(error.to_string().contains(&first.local_addr().to_string()), "got {error}");
 }
 
@@ -303,10 +303,10 @@ async fn contents_are_fetched_and_checked() {
 async fn raw_peer() -> (Connection, NodeLink, DataServer) {
     let server = server();
     let addresses = [server.local_addr().to_string()];
-    let (app, node) = tokio::join!(dial(&addresses, server.certificate_der()), async {
-        server.accept().await.unwrap().establish(ContentSource::empty()).await
+    let (app, node) = tokio::join!(dial(&addresses, server.certificate_der(), None), async {
+        server.accept().await.unwrap().establish(|_| ContentSource::empty()).await
     });
-    (app.unwrap(), node.unwrap(), server)
+    (app.unwrap(), node.unwrap().0, server)
 }
 
 async fn say(connection: &Connection, bytes: &[u8]) -> SendStream {

@@ -12,7 +12,7 @@ use super::{
     MAX_CONTENTS, MAX_ENTRIES, MAX_JOBS, WireError, attempts::IndexColumn, cut, device, enumeration, invalid,
     list, name, required, text, weight, within,
 };
-use crate::control::v1;
+use crate::{control::v1, trust::MAX_CAPABILITY_BYTES};
 
 impl From<AppToCoordinator> for v1::AppToCoordinator {
     fn from(message: AppToCoordinator) -> Self {
@@ -163,6 +163,7 @@ impl From<CoordinatorToApp> for v1::CoordinatorToApp {
             CoordinatorToApp::HeartbeatAck { sequence } => {
                 Message::HeartbeatAck(v1::HeartbeatAck { sequence })
             }
+            CoordinatorToApp::Capability(bytes) => Message::Capability(bytes),
         };
         Self { message: Some(message) }
     }
@@ -190,6 +191,10 @@ impl TryFrom<v1::CoordinatorToApp> for CoordinatorToApp {
                 failure: required("JobFailed.failure", failed.failure)?.try_into()?,
             },
             Message::HeartbeatAck(v1::HeartbeatAck { sequence }) => Self::HeartbeatAck { sequence },
+            Message::Capability(bytes) => {
+                within("CoordinatorToApp.capability", bytes.len(), MAX_CAPABILITY_BYTES)?;
+                Self::Capability(bytes)
+            }
         })
     }
 }

@@ -1,0 +1,288 @@
+//! A secured coordinator over loopback: the authorisation matrix, joining, renewing, expelling; each refusal changes nothing and
+//! is in the audit log.
+
+#![allow(clippy::unwrap_used, reason = "a test that cannot go on panics")]
+
+use std::{fs, time::Duration};
+
+use coordinator::{CoordinatorHandle, CoordinatorOptions, initialise, start};
+use farm_core::{
+    coordinator::timeline::TimelineQuery,
+    device::{DeviceInfo, DeviceKind, Features, Limits},
+    id::{AppId, AppIncarnation, NodeId, NodeSession},
+    message::{
+        AppHello, AppToCoordinator, Contact, CoordinatorToApp, CoordinatorToNode, NodeHello,
+        NodeToCoordinator, PROTOCOL_VERSION,
+    },
+};
+use proto::{
+    control::{self, Invitation, Session, SessionError},
+    trust::{Authority, IDENTITY_LIFETIME, Identity, JoinToken, Role},
+};
+use tempfile::TempDir;
+
+/// A secured coordinator and one member of each role.
+struct Farm {
+    state: TempDir,
+    handle: CoordinatorHandle,
+    address: String,
+    operator: Identity,
+    node: Identity,
+    app: Identity,
+}
+
+impl Farm {
+    async fn start() -> Self {
+        let state = tempfile::tempdir().unwrap();
+        let operator = initialise(state.path(), "farm", "boss").unwrap();
+        let handle = Self::coordinator(&state).await;
+        let address = handle.grpc_addr().to_string();
+        let node = join(&address, &operator, Role::Node, "n").await;
+        let app = join(&address, &operator, Role::App, "project").await;
+        Self { state, handle, address, operator, node, app }
+    }
+
+    async fn coordinator(state: &TempDir) -> CoordinatorHandle {
+        let state = Some(state.path().to_owned());
+        start(CoordinatorOptions { state, secured: true, ..CoordinatorOptions::embedded() }).await.unwrap()
+    }
+
+    fn audit(&self) -> String {
+        fs::read_to_string(self.state.path().join("audit.ndjson")).unwrap()
+    }
+}
+
+fn invitation(role: Role, name: Option<&str>) -> Invitation {
+    Invitation { role, name: name.map(str::to_owned), lifetime: Duration::from_secs(60), uses: 1 }
+}
+
+async fn token(address: &str, operator: &Identity, invitation: &Invitation) -> JoinToken {
+    control::create_token(address, Some(operator), invitation).await.unwrap().1
+}
+
+async fn join(address: &str, operator: &Identity, role: Role, name: &str) -> Identity {
+    let token = token(address, operator, &invitation(role, None)).await;
+    control::join(address, &token, Some(name)).await.unwrap()
+}
+
+fn is_denied<T>(outcome: Result<T, SessionError>) -> bool {
+    matches!(outcome, Err(SessionError::Denied { .. }))
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn each_role_may_do_what_the_matrix_says_and_nothing_else() {
+    let farm = Farm::start().await;
+    let address = farm.address.as_str();
+    // What each may: see the farm, the timeline, drain, make tokens, list tokens, take one back, list members, expel, bring jobs,
+    // give devices, renew.
+    let matrix: [(Option<&Identity>, [bool; 11]); 4] = [
+        (Some(&farm.operator), [true, true, true, true, true, true, true, true, true, false, true]),
+        (Some(&farm.app), [true, true, false, false, false, false, false, false, true, false, true]),
+        (Some(&farm.node), [false, false, false, false, false, false, false, false, false, true, true]),
+        (None, [false; 11]),
+    ];
+    let before = control::status(address, Some(&farm.operator)).await.unwrap();
+    for (who, allowed) in matrix {
+        let everything = TimelineQuery { app: None, task: None, max_segments: 0 };
+        let wanted = invitation(Role::App, None);
+        let renewed = match who {
+            Some(identity) => control::renew(address, identity).await,
+            None => Err(SessionError::Denied { reason: "nobody has nothing to renew".to_owned() }),
+        };
+        let denied = [
+            is_denied(control::status(address, who).await),
+            is_denied(control::timeline(address, who, everything).await),
+            // Whoever may is told that there is no such node, token or member.
+            is_denied(control::drain(address, who, NodeId(999)).await),
+            is_denied(control::create_token(address, who, &wanted).await),
+            is_denied(control::list_tokens(address, who).await),
+            is_denied(control::revoke_token(address, who, 999).await),
+            is_denied(control::list_members(address, who).await),
+            is_denied(control::expel(address, who, "gleaner://farm/app/nobody").await),
+            is_denied(control::connect_app(address, who).await),
+            is_denied(control::connect_node(address, who).await),
+            is_denied(renewed),
+        ];
+        assert_eq!(denied, allowed.map(|allowed| !allowed), "{who:?}");
+    }
+    assert_eq!(control::status(address, Some(&farm.operator)).await.unwrap(), before, "nothing changed");
+    let audit = farm.audit();
+    for what in ["see the farm", "operate the farm", "bring jobs", "give devices"] {
+        let line = audit.lines().find(|line| line.contains("\"refused\"") && line.contains(what));
+        assert!(line.is_some(), "no refusal to {what} in:\n{audit}");
+    }
+    farm.handle.shutdown().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_token_lets_in_whom_it_is_for_once() {
+    let farm = Farm::start().await;
+    let address = farm.address.as_str();
+    let for_a_name = token(address, &farm.operator, &invitation(Role::Node, Some("gpu-1"))).await;
+    let other_secret = JoinToken { secret: [1; 16], ..for_a_name.clone() };
+    assert!(is_denied(control::join(address, &other_secret, None).await), "a guessed secret");
+    let other_farm = JoinToken { authority: [1; 32], ..for_a_name.clone() };
+    assert!(
+        is_denied(control::join(address, &other_farm, None).await),
+        "another farm's coordinator is not believed"
+    );
+    assert!(is_denied(control::join(address, &for_a_name, Some("gpu-2")).await), "another name");
+    let joined = control::join(address, &for_a_name, None).await.unwrap();
+    assert_eq!(joined.principal().to_string(), "gleaner://farm/node/gpu-1");
+    assert!(is_denied(control::join(address, &for_a_name, None).await), "once");
+    let any_name = token(address, &farm.operator, &invitation(Role::Node, None)).await;
+    assert!(is_denied(control::join(address, &any_name, Some("gpu-1")).await), "the name is somebody's");
+
+    let (id, revoked) =
+        control::create_token(address, Some(&farm.operator), &invitation(Role::App, None)).await.unwrap();
+    control::revoke_token(address, Some(&farm.operator), id).await.unwrap();
+    assert!(is_denied(control::join(address, &revoked, Some("x")).await), "it was taken back");
+    let bad = [
+        Invitation { uses: 0, ..invitation(Role::App, None) },
+        Invitation { uses: 2, ..invitation(Role::App, Some("one")) },
+        Invitation { lifetime: Duration::ZERO, ..invitation(Role::App, None) },
+        invitation(Role::Coordinator, None),
+        invitation(Role::App, Some("no/name")),
+    ];
+    for bad in bad {
+        let refused = control::create_token(address, Some(&farm.operator), &bad).await;
+        assert!(matches!(refused, Err(SessionError::Refused { .. })), "{bad:?}: {refused:?}");
+    }
+    farm.handle.shutdown().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn members_of_another_farm_are_strangers_and_so_is_its_coordinator() {
+    let (farm, other) = (Farm::start().await, Farm::start().await);
+    let outcome = control::status(&farm.address, Some(&other.operator)).await;
+    assert!(is_denied(outcome), "both farms are called the same");
+    // A self-made authority of the farm's name is none.
+    let forged =
+        Authority::create("farm").unwrap().identity(Role::Operator, "boss", IDENTITY_LIFETIME).unwrap();
+    assert!(is_denied(control::status(&farm.address, Some(&forged)).await));
+    // An open farm is not this member's either.
+    let open = start(CoordinatorOptions::embedded()).await.unwrap();
+    let outcome = control::status(&open.grpc_addr().to_string(), Some(&farm.operator)).await;
+    let said = matches!(&outcome, Err(SessionError::Denied { reason }) if reason.contains("--insecure"));
+    assert!(said, "got {outcome:?}");
+    open.shutdown().await;
+    farm.handle.shutdown().await;
+    other.handle.shutdown().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn who_was_expelled_or_replaced_is_out_and_memberships_outlive_the_coordinator() {
+    let farm = Farm::start().await;
+    let operator = Some(&farm.operator);
+    let uri = farm.app.principal().to_string();
+    assert!(control::status(&farm.address, Some(&farm.app)).await.is_ok());
+    control::expel(&farm.address, operator, &uri).await.unwrap();
+    assert!(is_denied(control::status(&farm.address, Some(&farm.app)).await), "expelled");
+    let members = control::list_members(&farm.address, operator).await.unwrap();
+    assert_eq!(members, ["gleaner://farm/node/n", "gleaner://farm/operator/boss"]);
+    let again = token(&farm.address, &farm.operator, &invitation(Role::Node, Some("n"))).await;
+    let replaced = control::join(&farm.address, &again, None).await.unwrap();
+    assert!(
+        is_denied(control::connect_node(&farm.address, Some(&farm.node)).await),
+        "its name has another key now"
+    );
+    assert!(is_denied(control::renew(&farm.address, &farm.node).await), "and it gets no new certificate");
+
+    let Farm { state, handle, operator, .. } = farm;
+    handle.shutdown().await;
+    let handle = Farm::coordinator(&state).await;
+    let address = handle.grpc_addr().to_string();
+    assert!(control::status(&address, Some(&operator)).await.is_ok(), "the farm knows its members still");
+    assert!(control::connect_node(&address, Some(&replaced)).await.is_ok());
+    control::renew(&address, &replaced).await.unwrap();
+    assert!(control::connect_node(&address, Some(&replaced)).await.is_ok(), "under the renewed certificate");
+    handle.shutdown().await;
+}
+
+fn app_hello(resume: Option<(AppId, AppIncarnation)>) -> AppToCoordinator {
+    AppToCoordinator::Hello(AppHello {
+        protocol: PROTOCOL_VERSION,
+        name: "an app".to_owned(),
+        weight: 1.0,
+        global_stealing: false,
+        policy: String::new(),
+        resume,
+    })
+}
+
+type AppSession = Session<AppToCoordinator, CoordinatorToApp>;
+
+/// The session, and who the application is. Before the welcome comes what it shows to nodes.
+async fn app(address: &str, identity: &Identity) -> (AppSession, (AppId, AppIncarnation)) {
+    let mut session = control::connect_app(address, Some(identity)).await.unwrap();
+    session.sender.try_send(app_hello(None)).unwrap();
+    let first = session.receiver.recv().await.unwrap();
+    assert!(matches!(first, CoordinatorToApp::Capability(_)), "got {first:?}");
+    match session.receiver.recv().await.unwrap() {
+        CoordinatorToApp::Welcome { app, incarnation, .. } => (session, (app, incarnation)),
+        other => panic!("got {other:?}"),
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn nobody_goes_on_as_somebody_elses_application() {
+    let farm = Farm::start().await;
+    let other = join(&farm.address, &farm.operator, Role::App, "other").await;
+    let (session, who) = app(&farm.address, &farm.app).await;
+    let mut thief = control::connect_app(&farm.address, Some(&other)).await.unwrap();
+    thief.sender.try_send(app_hello(Some(who))).unwrap();
+    assert!(is_denied(thief.receiver.recv().await));
+    let status = control::status(&farm.address, Some(&farm.operator)).await.unwrap();
+    assert_eq!(status.apps.len(), 1, "nothing came of it");
+    assert!(status.apps[0].connected, "and its owner's session stands");
+    drop(session);
+    // The owner may.
+    let mut resumed = control::connect_app(&farm.address, Some(&farm.app)).await.unwrap();
+    resumed.sender.try_send(app_hello(Some(who))).unwrap();
+    assert!(matches!(resumed.receiver.recv().await, Ok(CoordinatorToApp::Capability(_))));
+    assert!(
+        matches!(resumed.receiver.recv().await, Ok(CoordinatorToApp::Welcome { app, .. }) if app == who.0)
+    );
+    assert!(farm.audit().contains("resumes somebody else's application"));
+    farm.handle.shutdown().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_node_has_the_name_of_its_identity() {
+    let farm = Farm::start().await;
+    let register = async |name: &str| {
+        let mut session = control::connect_node(&farm.address, Some(&farm.node)).await.unwrap();
+        let device = DeviceInfo {
+            name: "simulated".to_owned(),
+            kind: DeviceKind::Simulated,
+            score: 1_000.0,
+            features: Features::default(),
+            limits: Limits::UNBOUNDED,
+        };
+        let hello = NodeToCoordinator::Hello(NodeHello {
+            protocol: PROTOCOL_VERSION,
+            name: name.to_owned(),
+            session: NodeSession(77),
+            devices: vec![device],
+            contact: Contact { addresses: vec!["127.0.0.1:9".to_owned()], certificate_der: vec![1, 2, 3] },
+            inventory: Vec::new(),
+        });
+        session.sender.try_send(hello).unwrap();
+        session.receiver.recv().await
+    };
+    assert!(is_denied(register("somebody-else").await));
+    let status = control::status(&farm.address, Some(&farm.operator)).await.unwrap();
+    assert!(status.nodes.is_empty(), "nothing came of it");
+    assert!(matches!(register("n").await, Ok(CoordinatorToNode::Welcome { .. })));
+    assert!(matches!(register("n/second").await, Ok(CoordinatorToNode::Welcome { .. })));
+    farm.handle.shutdown().await;
+}
+
+#[test]
+fn a_farm_is_secured_once() {
+    let state = tempfile::tempdir().unwrap();
+    initialise(state.path(), "farm", "boss").unwrap();
+    let error = initialise(state.path(), "farm", "boss").unwrap_err().to_string();
+    assert!(error.contains("secured already") && error.contains("authority.pem"), "got {error}");
+    assert!(initialise(tempfile::tempdir().unwrap().path(), "no farm", "boss").is_err());
+}

@@ -1,0 +1,213 @@
+//! `farmctl init`, `join`, `token ...` and `member ...`: who belongs to a secured farm.
+
+use std::{
+    fs, io,
+    path::Path,
+    time::{Duration, SystemTime},
+};
+
+use anyhow::{Context as _, anyhow};
+use proto::{
+    control::{self, Invitation, v1::TokenStatus},
+    trust::{Identity, JoinToken, Role, check_name},
+};
+use serde_json::{Value, json};
+
+use crate::{
+    admin::{self, Admin},
+    cli::{Format, InitArgs, JoinArgs, MemberRole, MemberVerb, TokenVerb},
+    failure::Failure,
+    output::{self, printable},
+    target::Target,
+};
+
+/// Longest token that is read, in bytes.
+const MAX_TOKEN_BYTES: u64 = 4_096;
+
+/// Makes a farm's authority and its first operator.
+pub(crate) fn init(arguments: &InitArgs, target: &Target<'_>) -> Result<(), Failure> {
+    let file = target.identity_file("user")?;
+    let (farm, operator) = (&arguments.farm, &arguments.operator);
+    for (what, name) in [("--farm", farm), ("--operator", operator)] {
+        check_name(what, name).map_err(|error| Failure::Usage(error.into()))?;
+    }
+    // A place before an authority: one without an operator would be of no use.
+    check_writable(&file)?;
+    let identity = coordinator::initialise(&arguments.state, farm, operator)?;
+    keep(&identity, &file)?;
+    output::print_text(&format!(
+        "{farm} is secured: its authority is {}, and you are {} ({}).\n\
+         Start it:            farm-coordinator --state {} --listen HOST:PORT\n\
+         Let a machine join:  farmctl --coordinator HOST:PORT token create node\n\
+         Let somebody use it: farmctl --coordinator HOST:PORT token create app\n",
+        arguments.state.join(coordinator::AUTHORITY_FILE).display(),
+        identity.principal(),
+        file.display(),
+        arguments.state.display(),
+    ))
+}
+
+/// Becomes a member and keeps the identity.
+pub(crate) async fn join(arguments: &JoinArgs, target: &Target<'_>) -> Result<(), Failure> {
+    let usage = |error: anyhow::Error| Failure::Usage(error);
+    let text = match arguments.token.as_str() {
+        "-" => read_token().context("no token comes from standard input").map_err(usage)?,
+        text => text.to_owned(),
+    };
+    let token: JoinToken = text.parse().map_err(|error| usage(anyhow::Error::new(error)))?;
+    if let Some(name) = &arguments.name {
+        check_name("--name", name).map_err(|error| usage(error.into()))?;
+    }
+    // A place before a member: a token is used once.
+    for kind in ["user", "node"] {
+        let file = target.identity_file(kind)?;
+        check_writable(&file)?;
+    }
+    let identity = join_as(target.address(), &token, arguments.name.as_deref()).await?;
+    let kind = if identity.principal().role == Role::Node { "node" } else { "user" };
+    let file = target.identity_file(kind)?;
+    keep(&identity, &file)?;
+    let next = match identity.principal().role {
+        Role::Node => format!("farm-worker --coordinator {}", target.address()),
+        _ => format!("farmctl --coordinator {} status", target.address()),
+    };
+    output::print_text(&format!("You are {} ({}).\nNext: {next}\n", identity.principal(), file.display()))
+}
+
+/// A token without a name, and nobody who chose one, makes this host's.
+async fn join_as(address: &str, token: &JoinToken, name: Option<&str>) -> Result<Identity, Failure> {
+    let joined = control::join(address, token, name).await;
+    match (joined, name) {
+        (Err(control::SessionError::Denied { reason }), None) if reason.contains("choose one") => {
+            let host = host_name()
+                .ok_or_else(|| Failure::Usage(anyhow!("this host has no usable name: say --name")))?;
+            control::join(address, token, Some(&host)).await.map_err(admin::failure)
+        }
+        (joined, _) => joined.map_err(admin::failure),
+    }
+}
+
+fn host_name() -> Option<String> {
+    let name = fs::read_to_string("/proc/sys/kernel/hostname").ok()?.trim().to_owned();
+    check_name("host", &name).is_ok().then_some(name)
+}
+
+fn read_token() -> io::Result<String> {
+    use std::io::Read as _;
+
+    let mut text = String::new();
+    io::stdin().lock().take(MAX_TOKEN_BYTES).read_to_string(&mut text)?;
+    Ok(text)
+}
+
+/// Whether an identity could be written there.
+fn check_writable(file: &Path) -> Result<(), Failure> {
+    let folder =
+        file.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or_else(|| Path::new("."));
+    let probe = folder.join(format!(".gleaner-probe-{}", std::process::id()));
+    fs::create_dir_all(folder)
+        .and_then(|()| fs::write(&probe, b""))
+        .and_then(|()| fs::remove_file(&probe))
+        .with_context(|| format!("{} cannot be written", file.display()))?;
+    Ok(())
+}
+
+/// Writes an identity; one that is there already is moved out of the way.
+fn keep(identity: &Identity, file: &Path) -> Result<(), Failure> {
+    if file.exists() {
+        let mut names = (1_u32..).map(|number| file.with_extension(format!("{number}.pem")));
+        let earlier =
+            names.find(|earlier| !earlier.exists()).context("there are too many earlier identities")?;
+        fs::rename(file, &earlier)
+            .with_context(|| format!("{} cannot be kept as {}", file.display(), earlier.display()))?;
+        tell!("farmctl: the identity that was there is kept as {}", earlier.display());
+    }
+    Ok(identity.write(file)?)
+}
+
+/// Runs one of the verbs of tokens.
+pub(crate) async fn token(verb: &TokenVerb, target: &Target<'_>, format: Format) -> Result<(), Failure> {
+    let admin = Admin::new(target.existing().await?);
+    match verb {
+        TokenVerb::Create { role, name, expires, uses } => {
+            let role = match role {
+                MemberRole::Node => Role::Node,
+                MemberRole::App => Role::App,
+                MemberRole::Operator => Role::Operator,
+            };
+            let invitation = Invitation { role, name: name.clone(), lifetime: *expires, uses: *uses };
+            let (id, token) = admin.create_token(&invitation).await?;
+            let made = json!({
+                "id": id,
+                "token": token.to_string(),
+                "role": role.to_string(),
+                "name": name,
+                "expires_s": now_s() + expires.as_secs(),
+                "uses": uses,
+            });
+            // The token alone: scripts take it as it is.
+            output::print(&made, format, |_, _| format!("{token}\n"))
+        }
+        TokenVerb::Ls => {
+            let tokens: Vec<Value> = admin.tokens().await?.iter().map(shown).collect();
+            output::print(&tokens, format, |tokens, _| tokens_table(tokens))
+        }
+        TokenVerb::Revoke { id } => {
+            admin.revoke_token(*id).await?;
+            output::print_text(&format!("token {id} is taken back\n"))
+        }
+    }
+}
+
+fn shown(token: &TokenStatus) -> Value {
+    json!({
+        "id": token.id,
+        "role": token.role,
+        "name": Some(&token.name).filter(|name| !name.is_empty()),
+        "expires_s": token.expires_s,
+        "uses_left": token.uses_left,
+        "maker": token.maker,
+    })
+}
+
+fn tokens_table(tokens: &[Value]) -> String {
+    if tokens.is_empty() {
+        return "no token can be used: make one with `farmctl token create node|app|operator`\n".to_owned();
+    }
+    let text = |value: &Value| value.as_str().map_or_else(String::new, printable);
+    let mut table = output::table(["TOKEN", "ROLE", "NAME", "EXPIRES IN", "USES LEFT", "MADE BY"]);
+    for token in tokens {
+        let seconds = token["expires_s"].as_u64().unwrap_or(0).saturating_sub(now_s());
+        let minutes = Duration::from_secs(seconds).as_secs().div_ceil(60);
+        table.add_row([
+            token["id"].to_string(),
+            text(&token["role"]),
+            text(&token["name"]),
+            format!("{minutes} min"),
+            token["uses_left"].to_string(),
+            text(&token["maker"]),
+        ]);
+    }
+    format!("{table}\n")
+}
+
+/// Runs one of the verbs of members.
+pub(crate) async fn member(verb: &MemberVerb, target: &Target<'_>, format: Format) -> Result<(), Failure> {
+    let admin = Admin::new(target.existing().await?);
+    match verb {
+        MemberVerb::Ls => {
+            let members = admin.members().await?;
+            output::print(&members, format, |members, _| {
+                members.iter().map(|member| printable(member) + "\n").collect()
+            })
+        }
+        MemberVerb::Expel { member } => {
+            admin.expel(member).await?;
+            output::print_text(&format!("{} is no member any more\n", printable(member)))
+        }
+    }
+}
+
+fn now_s() -> u64 {
+    SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default().as_secs()
+}

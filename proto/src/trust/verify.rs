@@ -1,0 +1,161 @@
+//! Checking who is at the other end: certificates signed by the farm's authority, told apart by their one URI. Addresses and
+//! host names play no part: a farm's members move.
+
+use std::time::SystemTime;
+
+use rustls::{
+    CertificateError, DigitallySignedStruct, DistinguishedName, Error, RootCertStore, SignatureScheme,
+    client::{
+        danger::{HandshakeSignatureValid, ServerCertVerified, ServerCertVerifier},
+        verify_server_cert_signed_by_trust_anchor,
+    },
+    crypto::{WebPkiSupportedAlgorithms, ring, verify_tls13_signature},
+    pki_types::{CertificateDer, ServerName, UnixTime},
+    server::{
+        ParsedCertificate,
+        danger::{ClientCertVerified, ClientCertVerifier},
+    },
+};
+
+use super::{Member, Role};
+
+fn algorithms() -> WebPkiSupportedAlgorithms {
+    ring::default_provider().signature_verification_algorithms
+}
+
+/// Whether a certificate was signed by an authority, and is of this time.
+pub(crate) fn signed_by(
+    certificate: &CertificateDer<'_>,
+    authority: &CertificateDer<'static>,
+    now: SystemTime,
+) -> Result<(), Error> {
+    let since_1970 = now.duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
+    signed_at(certificate, authority, UnixTime::since_unix_epoch(since_1970))
+}
+
+fn signed_at(
+    certificate: &CertificateDer<'_>,
+    authority: &CertificateDer<'static>,
+    now: UnixTime,
+) -> Result<(), Error> {
+    let mut roots = RootCertStore::empty();
+    roots.add(authority.clone())?;
+    let parsed = ParsedCertificate::try_from(certificate)?;
+    verify_server_cert_signed_by_trust_anchor(&parsed, &roots, &[], now, algorithms().all)
+}
+
+fn refused() -> Error {
+    Error::InvalidCertificate(CertificateError::ApplicationVerificationFailure)
+}
+
+/// How a client knows the coordinator.
+#[derive(Debug)]
+pub(crate) enum CoordinatorCheck {
+    /// A member: by the authority in its own identity.
+    Authority(CertificateDer<'static>),
+    /// Who joins: by the blake3 of the authority, which the coordinator sends along.
+    Fingerprint([u8; 32]),
+}
+
+impl ServerCertVerifier for CoordinatorCheck {
+    fn verify_server_cert(
+        &self,
+        end_entity: &CertificateDer<'_>,
+        intermediates: &[CertificateDer<'_>],
+        _server_name: &ServerName<'_>,
+        _ocsp_response: &[u8],
+        now: UnixTime,
+    ) -> Result<ServerCertVerified, Error> {
+        let authority = match self {
+            Self::Authority(authority) => authority.clone(),
+            Self::Fingerprint(fingerprint) => intermediates
+                .iter()
+                .find(|sent| blake3::hash(sent) == *fingerprint)
+                .ok_or_else(refused)?
+                .clone()
+                .into_owned(),
+        };
+        signed_at(end_entity, &authority, now)?;
+        match Member::of_certificate(end_entity) {
+            Ok(member) if member.principal.role == Role::Coordinator => Ok(ServerCertVerified::assertion()),
+            Ok(_) | Err(_) => Err(refused()),
+        }
+    }
+
+    fn verify_tls12_signature(
+        &self,
+        _message: &[u8],
+        _certificate: &CertificateDer<'_>,
+        _signature: &DigitallySignedStruct,
+    ) -> Result<HandshakeSignatureValid, Error> {
+        Err(old_tls())
+    }
+
+    fn verify_tls13_signature(
+        &self,
+        message: &[u8],
+        certificate: &CertificateDer<'_>,
+        signature: &DigitallySignedStruct,
+    ) -> Result<HandshakeSignatureValid, Error> {
+        verify_tls13_signature(message, certificate, signature, &algorithms())
+    }
+
+    fn supported_verify_schemes(&self) -> Vec<SignatureScheme> {
+        algorithms().supported_schemes()
+    }
+}
+
+/// How a server knows members. Who they are and what they may do is asked afterwards.
+#[derive(Debug)]
+pub(crate) struct MemberCheck {
+    pub(crate) authority: CertificateDer<'static>,
+    /// False where who joins comes without a certificate.
+    pub(crate) mandatory: bool,
+}
+
+impl ClientCertVerifier for MemberCheck {
+    fn root_hint_subjects(&self) -> &[DistinguishedName] {
+        &[]
+    }
+
+    fn client_auth_mandatory(&self) -> bool {
+        self.mandatory
+    }
+
+    fn verify_client_cert(
+        &self,
+        end_entity: &CertificateDer<'_>,
+        _intermediates: &[CertificateDer<'_>],
+        now: UnixTime,
+    ) -> Result<ClientCertVerified, Error> {
+        signed_at(end_entity, &self.authority, now)?;
+        Member::of_certificate(end_entity).map_err(|_| refused())?;
+        Ok(ClientCertVerified::assertion())
+    }
+
+    fn verify_tls12_signature(
+        &self,
+        _message: &[u8],
+        _certificate: &CertificateDer<'_>,
+        _signature: &DigitallySignedStruct,
+    ) -> Result<HandshakeSignatureValid, Error> {
+        Err(old_tls())
+    }
+
+    fn verify_tls13_signature(
+        &self,
+        message: &[u8],
+        certificate: &CertificateDer<'_>,
+        signature: &DigitallySignedStruct,
+    ) -> Result<HandshakeSignatureValid, Error> {
+        verify_tls13_signature(message, certificate, signature, &algorithms())
+    }
+
+    fn supported_verify_schemes(&self) -> Vec<SignatureScheme> {
+        algorithms().supported_schemes()
+    }
+}
+
+fn old_tls() -> Error {
+    Error::General("TLS 1.2 is not spoken here".to_owned())
+}

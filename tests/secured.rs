@@ -1,0 +1,167 @@
+//! A secured farm as its people make it: `farmctl init`, `token`, `join`, the daemons with what these have written, and strangers.
+
+#![allow(clippy::unwrap_used, reason = "a test that cannot go on panics")]
+
+use std::{
+    fs,
+    os::unix::fs::PermissionsExt as _,
+    path::{Path, PathBuf},
+    process::Output,
+};
+
+use tests::{Process, farmctl};
+
+/// A secured coordinator, and where its people keep their identities.
+struct SecuredFarm {
+    folder: tempfile::TempDir,
+    _coordinator: Process,
+    grpc: String,
+}
+
+impl SecuredFarm {
+    fn start() -> Self {
+        let folder = tempfile::tempdir().unwrap();
+        let state = folder.path().join("state");
+        let operator = folder.path().join("operator.pem");
+        let made = farmctl(["init", text(&state), "--farm", "studio", "--identity", text(&operator)]);
+        assert!(made.status.success(), "{made:?}");
+        assert!(stdout(&made).contains("gleaner://studio/operator/operator"), "{made:?}");
+        let flags = ["--listen", "127.0.0.1:0", "--http", "127.0.0.1:0", "--state", text(&state)];
+        let mut coordinator = Process::start("farm-coordinator", flags);
+        let grpc = coordinator.next_json()["grpc"].as_str().unwrap().to_owned();
+        Self { folder, _coordinator: coordinator, grpc }
+    }
+
+    fn file(&self, name: &str) -> PathBuf {
+        self.folder.path().join(format!("{name}.pem"))
+    }
+
+    /// `farmctl` as somebody.
+    fn as_who(&self, who: &str, arguments: &[&str]) -> Output {
+        let identity = self.file(who);
+        farmctl(["--coordinator", &self.grpc, "--identity", text(&identity)].iter().chain(arguments))
+    }
+
+    fn join(&self, role: &str, name: &str) {
+        let token = stdout(&self.as_who("operator", &["token", "create", role]));
+        let joined = self.as_who(name, &["join", token.trim(), "--name", name]);
+        assert!(joined.status.success(), "{joined:?}");
+        let mode = fs::metadata(self.file(name)).unwrap().permissions().mode();
+        assert_eq!(mode & 0o777, 0o600, "the identity is its owner's alone");
+    }
+
+    fn worker(&self, flags: &[&str]) -> Process {
+        let common = ["--coordinator", &self.grpc, "--device", "sim", "--connect-timeout", "5s"];
+        Process::start("farm-worker", common.iter().chain(flags))
+    }
+}
+
+fn text(path: &Path) -> &str {
+    path.to_str().unwrap()
+}
+
+fn stdout(output: &Output) -> String {
+    String::from_utf8(output.stdout.clone()).unwrap()
+}
+
+fn stderr(output: &Output) -> String {
+    String::from_utf8(output.stderr.clone()).unwrap()
+}
+
+#[test]
+fn members_work_and_strangers_are_told_how_to_become_members() {
+    let farm = SecuredFarm::start();
+    farm.join("node", "gpu-1");
+    farm.join("app", "artist");
+    let node = farm.file("gpu-1");
+    let mut worker = farm.worker(&["--identity", text(&node)]);
+    assert_eq!(worker.next_json()["event"], "ready");
+
+    let status = farm.as_who("artist", &["-o", "json", "status"]);
+    let status: serde_json::Value = serde_json::from_slice(&status.stdout).unwrap();
+    assert_eq!(status["nodes"][0]["name"], "gpu-1", "the node has the name of its identity: {status}");
+
+    let drained = farm.as_who("artist", &["node", "drain", "gpu-1"]);
+    assert_eq!(drained.status.code(), Some(4), "an artist drains nothing: {drained:?}");
+    assert!(stderr(&drained).contains("gleaner://studio/app/artist may not operate the farm"), "{drained:?}");
+    let as_node = farm.as_who("gpu-1", &["status"]);
+    assert_eq!(as_node.status.code(), Some(4), "{as_node:?}");
+
+    // In plain text, whatever there is in this machine's home.
+    let stranger = farmctl(["--insecure", "--coordinator", &farm.grpc, "status"]);
+    assert_eq!(stranger.status.code(), Some(4), "{stranger:?}");
+    assert!(stderr(&stranger).contains("farmctl join TOKEN"), "{stranger:?}");
+    let (ended, words) = farm.worker(&["--insecure"]).finish();
+    assert_eq!(ended.code(), Some(4), "{words}");
+    let (ended, words) = farm.worker(&["--identity", text(&farm.file("artist"))]).finish();
+    assert_eq!(ended.code(), Some(2), "{words}");
+    assert!(words.contains("not of a node"), "{words}");
+
+    let drained = farm.as_who("operator", &["node", "drain", "gpu-1"]);
+    assert!(drained.status.success(), "{drained:?}");
+    let (ended, words) = worker.finish();
+    assert!(ended.success(), "{words}");
+    let audit = fs::read_to_string(farm.folder.path().join("state/audit.ndjson")).unwrap();
+    for event in ["token created", "joined", "refused", "drain"] {
+        assert!(audit.contains(&format!("\"event\":\"{event}\"")), "no {event:?} in:\n{audit}");
+    }
+    let token = stdout(&farm.as_who("operator", &["token", "create", "app"]));
+    assert!(!audit.contains(&token.trim()[13..45]), "no secret is in the log");
+}
+
+#[test]
+fn a_token_is_listed_taken_back_and_used_once() {
+    let farm = SecuredFarm::start();
+    let made = farm
+        .as_who("operator", &["-o", "json", "token", "create", "node", "--name", "gpu-7", "--expires", "5m"]);
+    let made: serde_json::Value = serde_json::from_slice(&made.stdout).unwrap();
+    let token = made["token"].as_str().unwrap();
+    let listed = stdout(&farm.as_who("operator", &["token", "ls"]));
+    assert!(listed.contains("gpu-7") && listed.contains("5 min"), "{listed}");
+    assert!(!listed.contains(token), "the list holds no secrets:\n{listed}");
+    let joined = farm.as_who("gpu-7", &["join", token]);
+    assert!(joined.status.success(), "{joined:?}");
+    let again = farm.as_who("gpu-7", &["join", token]);
+    assert_eq!(again.status.code(), Some(4), "{again:?}");
+    assert!(fs::exists(farm.file("gpu-7")).unwrap(), "a failed join takes nothing away");
+    let slip = farm.as_who("x", &["join", &token[..40]]);
+    assert_eq!(slip.status.code(), Some(2), "{slip:?}");
+    assert!(!stderr(&slip).contains(&token[13..40]), "an error does not repeat a secret: {slip:?}");
+
+    let second = farm.as_who("operator", &["-o", "json", "token", "create", "app"]);
+    let second: serde_json::Value = serde_json::from_slice(&second.stdout).unwrap();
+    let revoked = farm.as_who("operator", &["token", "revoke", &second["id"].to_string()]);
+    assert!(revoked.status.success(), "{revoked:?}");
+    let refused = farm.as_who("y", &["join", second["token"].as_str().unwrap(), "--name", "y"]);
+    assert_eq!(refused.status.code(), Some(4), "{refused:?}");
+
+    let members = stdout(&farm.as_who("operator", &["member", "ls"]));
+    assert_eq!(members, "gleaner://studio/node/gpu-7\ngleaner://studio/operator/operator\n");
+    let expelled = farm.as_who("operator", &["member", "expel", "gleaner://studio/node/gpu-7"]);
+    assert!(expelled.status.success(), "{expelled:?}");
+    let (ended, words) = farm.worker(&["--identity", text(&farm.file("gpu-7"))]).finish();
+    assert_eq!(ended.code(), Some(4), "{words}");
+}
+
+#[test]
+fn an_identity_that_is_there_is_kept_when_another_takes_its_place() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("user.pem");
+    for farm in ["first", "second"] {
+        let state = folder.path().join(farm);
+        let made = farmctl(["init", text(&state), "--farm", farm, "--identity", text(&file)]);
+        assert!(made.status.success(), "{made:?}");
+    }
+    let read = |name: &str| fs::read_to_string(folder.path().join(name)).unwrap();
+    assert!(
+        read("user.pem").contains("gleaner://second/") && read("user.1.pem").contains("gleaner://first/")
+    );
+    let again = farmctl(["init", text(&folder.path().join("first")), "--identity", text(&file)]);
+    assert_eq!(again.status.code(), Some(1), "{again:?}");
+    assert!(read("user.pem").contains("gleaner://second/"), "what failed took nothing away");
+    let broken = folder.path().join("broken.pem");
+    fs::write(&broken, "nothing").unwrap();
+    let refused = farmctl(["--identity", text(&broken), "status"]);
+    assert_eq!(refused.status.code(), Some(2), "{refused:?}");
+    assert!(stderr(&refused).contains("broken.pem"), "{refused:?}");
+}
