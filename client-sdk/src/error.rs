@@ -66,6 +66,15 @@ pub enum FarmError {
         /// How long it waited.
         waited: Duration,
     },
+    /// Jobs were planned on nodes, and within the patience none of them let us in: a firewall between, say, or addresses that
+    /// only other machines know.
+    #[error("no node of the farm could be reached for {waited:.1?}; the last one tried: {reason}")]
+    NoNodeReached {
+        /// How long it was tried.
+        waited: Duration,
+        /// Which node, and why not.
+        reason: String,
+    },
     /// The graph cannot be run.
     #[error(transparent)]
     Graph(#[from] GraphError),
@@ -174,7 +183,10 @@ impl FarmError {
     #[must_use]
     pub const fn can_be_retried(&self) -> bool {
         match self {
-            Self::Unreachable { .. } | Self::CoordinatorLost { .. } | Self::NoFittingDevice { .. } => true,
+            Self::Unreachable { .. }
+            | Self::CoordinatorLost { .. }
+            | Self::NoFittingDevice { .. }
+            | Self::NoNodeReached { .. } => true,
             Self::JobFailed { failure, .. } => failure.can_be_retried(),
             Self::Options { .. }
             | Self::Refused { .. }

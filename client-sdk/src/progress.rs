@@ -21,6 +21,8 @@ pub struct Progress {
     pub active_tasks: Vec<Arc<str>>,
     /// Why jobs wait for a device, if they do.
     pub waiting: Option<WaitReason>,
+    /// Whether no node lets us in, though jobs are planned on some.
+    pub out_of_reach: bool,
     /// Whether the coordinator is connected; while it is not, work on the nodes goes on.
     pub coordinator: CoordinatorLink,
 }

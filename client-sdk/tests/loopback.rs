@@ -88,6 +88,26 @@ async fn a_large_content_leaves_the_application_once_for_many_nodes() {
     farm.stop().await;
 }
 
+/// Seen in `tests/spread.sh` before its bridge let packets through: planned, unreachable, planned again, without an end or a word.
+#[tokio::test(flavor = "multi_thread")]
+async fn a_run_that_reaches_no_node_ends_and_names_one() {
+    let mut farm = TestFarm::start(0, &[]).await;
+    let nobody = format!(
+        "127.0.0.1:{}",
+        std::net::UdpSocket::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port()
+    );
+    farm.add_worker(&["sim"], |options| WorkerOptions { advertise: vec![nobody.clone()], ..options }).await;
+    let options = FarmOptions { patience: Duration::from_millis(500), ..farm.options() };
+    let app = Farm::connect(options).await.unwrap();
+    let error =
+        app.run(TaskGraph::new().task("echo", Echoes { jobs: 3, ..Echoes::default() })).await.unwrap_err();
+    let named = matches!(&error, FarmError::NoNodeReached { reason, .. } if reason.contains("node-"));
+    assert!(named, "got {error}");
+    assert!(error.can_be_retried(), "the network may come back");
+    app.close().await;
+    farm.stop().await;
+}
+
 /// What the jobs of a test brought back, in order of arrival.
 type Brought = Arc<Mutex<Vec<u32>>>;
 

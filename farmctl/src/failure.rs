@@ -47,9 +47,9 @@ impl Failure {
 impl Failure {
     pub(crate) fn of_run(error: FarmError) -> Self {
         match error {
-            FarmError::Unreachable { .. } | FarmError::CoordinatorLost { .. } => {
-                Self::Unreachable(error.into())
-            }
+            FarmError::Unreachable { .. }
+            | FarmError::CoordinatorLost { .. }
+            | FarmError::NoNodeReached { .. } => Self::Unreachable(error.into()),
             FarmError::Denied { .. } => Self::Denied(error.into()),
             error => Self::Work(error.into()),
         }

@@ -94,7 +94,7 @@ async fn tell_lines(progress: &mut watch::Receiver<Progress>, units: Units) {
                 "replanned": now.replanned,
                 "nodes": now.nodes,
                 "tasks": now.active_tasks.iter().map(|name| &**name).collect::<Vec<&str>>(),
-                "waiting": now.waiting.map(wait_words),
+                "waiting": waits(&now),
             })
         };
         if let Some(Early { field: (name, value), .. }) = early.known().await {
@@ -135,9 +135,9 @@ async fn tell_bar(progress: &mut watch::Receiver<Progress>, units: Units) {
 async fn tell_waits(progress: &mut watch::Receiver<Progress>) {
     let mut told = None;
     loop {
-        let waiting = progress.borrow_and_update().waiting;
+        let waiting = waits(&progress.borrow_and_update());
         if let Some(reason) = waiting.filter(|_| waiting != told) {
-            tell!("farmctl: waiting: {}", wait_words(reason));
+            tell!("farmctl: waiting: {reason}");
         }
         told = waiting;
         if progress.changed().await.is_err() {
@@ -147,8 +147,8 @@ async fn tell_waits(progress: &mut watch::Receiver<Progress>) {
 }
 
 fn message(now: &Progress, units: &Units, elapsed: Duration) -> String {
-    if let Some(reason) = now.waiting {
-        return format!("waiting: {}", wait_words(reason));
+    if let Some(reason) = waits(now) {
+        return format!("waiting: {reason}");
     }
     if now.coordinator == CoordinatorLink::Reconnecting {
         return "coordinator lost, trying again; nodes go on working".to_owned();
@@ -162,10 +162,13 @@ fn message(now: &Progress, units: &Units, elapsed: Duration) -> String {
     format!("{} {}/s  ETA {}  nodes {}", HumanCount(whole(rate)), units.name, clock(left), now.nodes)
 }
 
-const fn wait_words(reason: WaitReason) -> &'static str {
-    match reason {
-        WaitReason::NoNode => "no node is registered at the coordinator",
-        WaitReason::NoFittingDevice => "no device of the farm fits the jobs",
+/// Why nothing goes on, if it does not.
+const fn waits(now: &Progress) -> Option<&'static str> {
+    match now.waiting {
+        Some(WaitReason::NoNode) => Some("no node is registered at the coordinator"),
+        Some(WaitReason::NoFittingDevice) => Some("no device of the farm fits the jobs"),
+        None if now.out_of_reach => Some("no node of the farm can be reached from here, trying again"),
+        None => None,
     }
 }
 

@@ -66,6 +66,8 @@ pub(super) struct Links {
 struct NodeLink {
     serial: u64,
     state: State,
+    /// Whether the node has let us in.
+    welcomed: bool,
 }
 
 enum State {
@@ -108,6 +110,17 @@ impl Links {
         self.links.values().filter(|link| matches!(link.state, State::Up(_))).count()
     }
 
+    /// Whether a node has let us in.
+    pub(super) fn reach_any(&self) -> bool {
+        self.links.values().any(|link| link.welcomed)
+    }
+
+    pub(super) fn welcomed(&mut self, key: LinkKey) {
+        if let Some(link) = self.links.get_mut(&(key.node, key.session)) {
+            link.welcomed = true;
+        }
+    }
+
     pub(super) fn is_current(&self, key: LinkKey) -> bool {
         self.links.get(&(key.node, key.session)).is_some_and(|link| link.serial == key.serial)
     }
@@ -121,7 +134,7 @@ impl Links {
         let link = NewLink { key, contact, identity: self.identity.clone(), contents: self.contents.clone() };
         let task = run_link(link, self.results.clone(), self.inputs.clone());
         let state = State::Connecting(tokio::spawn(task).abort_handle());
-        self.links.insert((node, session), NodeLink { serial, state });
+        self.links.insert((node, session), NodeLink { serial, state, welcomed: false });
     }
 
     /// A link stands. Gives whether it is still wanted.
@@ -145,6 +158,11 @@ impl Links {
             self.links.remove(&(key.node, key.session));
         }
         current
+    }
+
+    pub(super) fn is_connecting(&self, node: NodeId, session: NodeSession) -> bool {
+        let link = self.links.get(&(node, session));
+        link.is_some_and(|link| matches!(link.state, State::Connecting(_)))
     }
 
     /// Forgets a link; what stands of it is to be closed.

@@ -15,7 +15,7 @@ use std::{
 use bytes::Bytes;
 use farm_core::{
     device::Requirements,
-    id::{JobAttempt, JobIndex, TaskId},
+    id::{JobAttempt, JobIndex, NodeId, TaskId},
     ledger::{Effect, Event, Ledger, SubmittedJob},
     message::{AppHello, AppToCoordinator, CoordinatorToApp, NodeToApp},
     time,
@@ -283,6 +283,7 @@ impl Driver {
             Input::NodeEnded { key, reason } => {
                 if self.links.ended(key) {
                     tracing::info!(node = %key.node, reason, "link to a node ended");
+                    self.not_reached(key.node, &reason);
                     self.tell_ledger(Event::NodeLost { node: key.node, session: key.session });
                 }
             }
@@ -358,7 +359,11 @@ impl Driver {
         for Received { message, payload } in received {
             match &message {
                 NodeToApp::Result(header) => self.payloads.push_back((header.job, payload)),
-                NodeToApp::Welcome { .. } | NodeToApp::Refused { .. } => {}
+                NodeToApp::Welcome { .. } => {
+                    self.links.welcomed(key);
+                    self.runs.reached();
+                }
+                NodeToApp::Refused { reason } => self.not_reached(key.node, reason),
             }
             self.ledger.handle(now, Event::FromNode { node: key.node, session: key.session, message });
         }
@@ -393,6 +398,9 @@ impl Driver {
                     self.links.send(node, session, message, &self.programs)
                 }
                 Effect::Disconnect { node, session } => {
+                    if self.links.is_connecting(node, session) {
+                        self.not_reached(node, "no answer");
+                    }
                     if let Some(sender) = self.links.disconnect(node, session) {
                         self.closing_links
                             .spawn(async move { sender.close_after_sent("no longer needed").await });
@@ -422,6 +430,12 @@ impl Driver {
         while self.closing_links.try_join_next().is_some() {}
     }
 
+    fn not_reached(&mut self, node: NodeId, reason: &str) {
+        if !self.links.reach_any() {
+            self.runs.not_reached(format!("{node}: {reason}"), Instant::now());
+        }
+    }
+
     fn take_payload(&mut self, job: JobAttempt) -> Option<Payload> {
         let at = self.payloads.iter().position(|(attempt, _)| *attempt == job)?;
         self.payloads.remove(at).map(|(_, payload)| payload)
@@ -438,15 +452,13 @@ impl Driver {
     fn publish(&self) {
         let replanned = self.ledger.counts().replanned_jobs;
         let nodes = self.links.count();
-        let waiting = self.runs.waiting();
+        let (waiting, out_of_reach) = (self.runs.waiting(), self.runs.is_out_of_reach());
         let coordinator =
             if self.coordinator.is_lost() { CoordinatorLink::Reconnecting } else { CoordinatorLink::Up };
         self.progress.send_if_modified(|progress| {
-            let changed = (progress.replanned, progress.nodes, progress.waiting, progress.coordinator)
-                != (replanned, nodes, waiting, coordinator);
-            (progress.replanned, progress.nodes, progress.waiting, progress.coordinator) =
-                (replanned, nodes, waiting, coordinator);
-            changed
+            let before = progress.clone();
+            *progress = Progress { replanned, nodes, waiting, out_of_reach, coordinator, ..before.clone() };
+            *progress != before
         });
     }
 

@@ -25,6 +25,7 @@ pub(super) struct Runs {
     /// Which jobs were asked for together, first and last index: a plan that comes unasked names jobs, not batches.
     batches: BTreeMap<BatchId, (TaskId, RangeInclusive<u32>)>,
     waits: BTreeMap<BatchId, Waiting>,
+    out_of_reach: Option<OutOfReach>,
     stopped: bool,
 }
 
@@ -41,6 +42,13 @@ struct Waiting {
     since: Instant,
 }
 
+/// Nodes were named, and none lets us in.
+struct OutOfReach {
+    since: Instant,
+    /// Of the node that was tried last.
+    reason: String,
+}
+
 impl Runs {
     pub(super) const fn new(patience: Duration) -> Self {
         Self {
@@ -48,6 +56,7 @@ impl Runs {
             patience,
             batches: BTreeMap::new(),
             waits: BTreeMap::new(),
+            out_of_reach: None,
             stopped: false,
         }
     }
@@ -72,6 +81,26 @@ impl Runs {
         self.runs.remove(&tasks.start);
         self.batches.retain(|_, (task, _)| !tasks.contains(&task.0));
         self.waits.retain(|_, wait| !tasks.contains(&wait.task.0));
+        if self.runs.is_empty() {
+            self.out_of_reach = None;
+        }
+    }
+
+    /// A node was tried in vain, and no other one lets us in.
+    pub(super) fn not_reached(&mut self, reason: String, now: Instant) {
+        if !self.runs.is_empty() {
+            self.out_of_reach.get_or_insert(OutOfReach { since: now, reason: String::new() }).reason = reason;
+        }
+    }
+
+    /// A node has let us in.
+    pub(super) fn reached(&mut self) {
+        self.out_of_reach = None;
+    }
+
+    /// Whether no node lets us in.
+    pub(super) const fn is_out_of_reach(&self) -> bool {
+        self.out_of_reach.is_some()
     }
 
     pub(super) fn is_running(&self, task: TaskId) -> bool {
@@ -129,7 +158,9 @@ impl Runs {
     }
 
     pub(super) fn next_wake(&self) -> Option<Instant> {
-        self.waits.values().filter_map(|wait| wait.since.checked_add(self.patience)).min()
+        let waits = self.waits.values().map(|wait| wait.since);
+        let since = waits.chain(self.out_of_reach.as_ref().map(|out| out.since));
+        since.filter_map(|since| since.checked_add(self.patience)).min()
     }
 
     /// Ends the runs whose patience is at its end.
@@ -149,6 +180,11 @@ impl Runs {
             if let Some(run) = run.filter(|run| run.tasks.contains(&task.0)) {
                 run.end(RunEnd::NoFittingDevice { task, reason, waited });
             }
+        }
+        let waited = |out: &OutOfReach| now.saturating_duration_since(out.since);
+        if let Some(out) = self.out_of_reach.take_if(|out| waited(out) >= patience) {
+            let (waited, reason) = (waited(&out), out.reason);
+            self.end_all(|| RunEnd::Farm(FarmError::NoNodeReached { waited, reason: reason.clone() }));
         }
     }
 
@@ -258,6 +294,32 @@ mod tests {
         assert_eq!(runs.waiting(), None);
         drop(runs);
         assert!(matches!(events.try_recv(), Ok(RunEvent::Ended(RunEnd::Farm(FarmError::Closed)))));
+    }
+
+    #[test]
+    fn patience_ends_runs_that_no_node_lets_in() {
+        let mut runs = Runs::new(Duration::from_secs(60));
+        let (sender, events) = mpsc::channel();
+        let start = Instant::now();
+        runs.not_reached("nobody runs".to_owned(), start);
+        assert!(!runs.is_out_of_reach(), "without a run nobody waits");
+        runs.start(0..1, sender, None);
+        runs.not_reached("first".to_owned(), start);
+        runs.reached();
+        assert_eq!(runs.next_wake(), None);
+        let again = start + Duration::from_secs(5);
+        runs.not_reached("second".to_owned(), again);
+        runs.not_reached("third".to_owned(), start + Duration::from_secs(50));
+        assert_eq!(runs.next_wake(), Some(again + Duration::from_secs(60)));
+        runs.act_on_timers(again + Duration::from_secs(59));
+        assert!(events.try_recv().is_err());
+        runs.act_on_timers(again + Duration::from_secs(60));
+        let Ok(RunEvent::Ended(RunEnd::Farm(FarmError::NoNodeReached { reason, .. }))) = events.try_recv()
+        else {
+            panic!("the run must end")
+        };
+        assert_eq!(reason, "third", "what was tried last");
+        assert!(!runs.is_out_of_reach());
     }
 
     /// After a node is lost the coordinator plans on its own: such a plan answers no request.
