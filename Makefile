@@ -33,4 +33,4 @@ check:
 
 # All figures beside their bars; wants a quiet machine and five minutes. Goes on past a bench that misses one.
 bench: build
-	@missed=0; for bench in scheduler steal fairness scaling; do ./target/release/farmctl bench $$bench || missed=1; done; exit $$missed
+	@missed=0; for bench in scheduler steal fairness scaling recovery; do ./target/release/farmctl bench $$bench || missed=1; done; exit $$missed

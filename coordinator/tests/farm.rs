@@ -54,6 +54,7 @@ async fn node(address: &str) -> NodeSessionLink {
     };
     let hello = NodeHello {
         protocol: PROTOCOL_VERSION,
+        node: None,
         name: "a node".to_owned(),
         session: NodeSession(77),
         devices: vec![device],
@@ -73,6 +74,7 @@ fn plan_request(jobs: u32) -> AppToCoordinator {
         needs: Requirements::ANY,
         module: None,
         contents: Vec::new(),
+        held: Vec::new(),
     })
 }
 

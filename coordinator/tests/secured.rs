@@ -261,6 +261,7 @@ async fn a_node_has_the_name_of_its_identity() {
         };
         let hello = NodeToCoordinator::Hello(NodeHello {
             protocol: PROTOCOL_VERSION,
+            node: None,
             name: name.to_owned(),
             session: NodeSession(77),
             devices: vec![device],

@@ -6,8 +6,8 @@ use serde::{Deserialize, Serialize};
 use crate::{
     device::{DeviceInfo, Requirements},
     id::{
-        AppId, AppIncarnation, BatchId, ContentHash, DeviceIndex, Epoch, JobAttempt, JobId, JobIndex, NodeId,
-        NodeSession, StealId, TaskId,
+        AppId, AppIncarnation, Attempt, BatchId, ContentHash, DeviceIndex, Epoch, JobAttempt, JobId,
+        JobIndex, NodeId, NodeSession, StealId, TaskId,
     },
     program::Content,
     time::Instant,
@@ -93,6 +93,19 @@ pub struct PlanJob {
     pub cost: CostNs,
 }
 
+/// Where a job is that an earlier coordinator planned.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct HeldJob {
+    /// The job inside the request's task.
+    pub index: JobIndex,
+    /// The life of the node that holds it.
+    pub session: NodeSession,
+    /// The device it was planned for.
+    pub device: DeviceIndex,
+    /// The attempt there.
+    pub attempt: Attempt,
+}
+
 /// One batch of jobs to be placed (10-scheduling.md section 1).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct PlanRequest {
@@ -109,6 +122,9 @@ pub struct PlanRequest {
     pub module: Option<ContentHash>,
     /// Task allocations and modules the jobs use: a device that holds them is preferred.
     pub contents: Vec<Content>,
+    /// Those of the jobs that have a place, when the request is repeated: a coordinator that has not planned them takes them
+    /// over as they are.
+    pub held: Vec<HeldJob>,
 }
 
 /// Attempts placed on one device.
@@ -270,6 +286,8 @@ pub struct NodeHello {
     pub protocol: u32,
     /// For people, and the node's identity over restarts: a second session of one name fences the first.
     pub name: String,
+    /// Its id at the coordinator that it was registered with last.
+    pub node: Option<NodeId>,
     /// This life of the worker process.
     pub session: NodeSession,
     /// The devices, by [`DeviceIndex`].

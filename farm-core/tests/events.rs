@@ -12,9 +12,9 @@ use farm_core::{
     ledger::{self, Ledger, SubmittedJob},
     message::{
         AppHello, AppToCoordinator, AppToNode, Contact, CoordinatorToApp, CoordinatorToNode, CostNs,
-        DevicePlan, Executed, JobFailure, JobTicket, JobTrace, LatencyClass, Liveness, NodeHello, NodePlan,
-        NodeToApp, NodeToCoordinator, PROTOCOL_VERSION, Plan, PlanJob, PlanRequest, Priority, ResultAck,
-        ResultHeader, WaitReason,
+        DevicePlan, Executed, HeldJob, JobFailure, JobTicket, JobTrace, LatencyClass, Liveness, NodeHello,
+        NodePlan, NodeToApp, NodeToCoordinator, PROTOCOL_VERSION, Plan, PlanJob, PlanRequest, Priority,
+        ResultAck, ResultHeader, WaitReason,
     },
     program::Content,
     time::Instant,
@@ -111,6 +111,14 @@ fn coordinator_event(step: Step) -> coordinator::Event {
             },
             module: step.one.is_multiple_of(2).then_some(ContentHash([step.two; 32])),
             contents: vec![content(1)],
+            held: (0..step.four)
+                .map(|index| HeldJob {
+                    index: JobIndex(index.into()),
+                    session: NodeSession(u64::from(step.one / 2)),
+                    device: DeviceIndex((step.three / 2).into()),
+                    attempt: attempt(0, index, index * 2).attempt,
+                })
+                .collect(),
         })),
         8 => from_app(AppToCoordinator::AlreadyDelivered(vec![
             attempt(step.two, step.three, 0).job,
@@ -125,6 +133,7 @@ fn coordinator_event(step: Step) -> coordinator::Event {
         16 if step.four == 0 => from_app(AppToCoordinator::Goodbye),
         1 | 3 => from_node(NodeToCoordinator::Hello(NodeHello {
             protocol: PROTOCOL_VERSION,
+            node: step.one.is_multiple_of(2).then(|| NodeId(step.one.into())),
             name: format!("node-{}", step.two),
             session: NodeSession(u64::from(step.three / 2)),
             devices: (0..=step.two).map(device).collect(),
@@ -428,8 +437,8 @@ proptest! {
     #![proptest_config(ProptestConfig { cases: 2_000, failure_persistence: None, ..ProptestConfig::default() })]
 
     #[test]
-    fn the_coordinator_keeps_its_invariants(steps in steps(20)) {
-        let mut machine = CoordinatorMachine::new(CoordinatorConfig::new(Epoch(1), 1));
+    fn the_coordinator_keeps_its_invariants(epoch in 1_u32..3, steps in steps(20)) {
+        let mut machine = CoordinatorMachine::new(CoordinatorConfig::new(Epoch(epoch), 1));
         let mut now = Instant::ZERO;
         for step in steps {
             let now = after(&mut now, step);

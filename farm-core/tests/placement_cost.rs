@@ -32,6 +32,7 @@ fn farm() -> CoordinatorMachine {
         };
         let hello = NodeHello {
             protocol: PROTOCOL_VERSION,
+            node: None,
             name: format!("node-{node}"),
             session: NodeSession(node),
             devices: (0..DEVICES_PER_NODE).map(device).collect(),
@@ -67,6 +68,7 @@ fn request(batch: u32) -> Event {
         needs: Requirements::ANY,
         module: None,
         contents: Vec::new(),
+        held: Vec::new(),
     };
     Event::FromApp { link: APP, message: AppToCoordinator::Plan(request) }
 }

@@ -432,6 +432,8 @@ pub(crate) enum BenchName {
     Fairness,
     /// Speed-up on equal jobs, by devices and by nodes.
     Scaling,
+    /// A coordinator killed with 100,000 jobs outstanding: how soon work is done again, how much is done twice.
+    Recovery,
     /// Mutual information: runtime over iterations and speed-up on given devices, overhead by simulated nodes.
     Mi,
 }

@@ -16,7 +16,7 @@ use std::{
 
 use anyhow::{Context as _, bail};
 use serde_json::Value;
-use tempfile::NamedTempFile;
+use tempfile::{NamedTempFile, TempDir};
 
 /// Longest wait for a daemon's ready line; a loaded two-core machine needs a second for nine.
 const READY_PATIENCE: Duration = Duration::from_secs(30);
@@ -58,6 +58,8 @@ pub(crate) struct ProcessFarm {
     workers: Vec<Daemon>,
     coordinator: Daemon,
     grpc: String,
+    /// The coordinator's state, which its successors take over.
+    state: TempDir,
     /// The workers' settings; the file lives as long as they do.
     _settings: NamedTempFile,
 }
@@ -69,15 +71,8 @@ impl ProcessFarm {
     /// A binary is not beside this one, or a daemon does not become ready: the error holds the end of its stderr.
     pub(crate) fn start(shape: &Shape) -> anyhow::Result<Self> {
         let settings = worker_settings(shape.local_stealing)?;
-        let mut coordinator = Daemon::start(
-            "farm-coordinator",
-            ["--insecure", "--listen", "127.0.0.1:0", "--http", "127.0.0.1:0"].map(OsString::from),
-        )?;
-        let ready = coordinator.ready()?;
-        let grpc = ready["grpc"]
-            .as_str()
-            .with_context(|| format!("the coordinator's ready line names no address: {ready}"))?
-            .to_owned();
+        let state = TempDir::new().context("no place for the coordinator's state")?;
+        let (coordinator, grpc) = start_coordinator("127.0.0.1:0", &state)?;
         let mut workers = Vec::with_capacity(shape.workers.len());
         for (number, devices) in shape.workers.iter().enumerate() {
             let name = format!("bench-{number}");
@@ -92,7 +87,17 @@ impl ProcessFarm {
         for worker in &mut workers {
             worker.ready()?;
         }
-        Ok(Self { workers, coordinator, grpc, _settings: settings })
+        Ok(Self { workers, coordinator, grpc, state, _settings: settings })
+    }
+
+    /// Kills the coordinator, and starts another one at the same address with what it has left on disk. Blocks.
+    ///
+    /// # Errors
+    /// It does not become ready.
+    pub(crate) fn replace_coordinator(&mut self) -> anyhow::Result<()> {
+        self.coordinator.kill();
+        (self.coordinator, self.grpc) = start_coordinator(&self.grpc, &self.state)?;
+        Ok(())
     }
 
     /// Where applications connect.
@@ -109,6 +114,19 @@ impl ProcessFarm {
             workers: workers.sum::<anyhow::Result<Duration>>()?,
         })
     }
+}
+
+/// A coordinator and its address.
+fn start_coordinator(listen: &str, state: &TempDir) -> anyhow::Result<(Daemon, String)> {
+    let mut arguments: Vec<OsString> =
+        ["--insecure", "--listen", listen, "--http", "127.0.0.1:0", "--state"].map(OsString::from).into();
+    arguments.push(state.path().into());
+    let mut coordinator = Daemon::start("farm-coordinator", arguments)?;
+    let ready = coordinator.ready()?;
+    let grpc = ready["grpc"].as_str();
+    let grpc = grpc.with_context(|| format!("the coordinator's ready line names no address: {ready}"))?;
+    let grpc = grpc.to_owned();
+    Ok((coordinator, grpc))
 }
 
 /// User and system time of a farm's processes.

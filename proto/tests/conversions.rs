@@ -16,8 +16,8 @@ use farm_core::{
     },
     message::{
         AppHello, AppToCoordinator, Contact, CoordinatorToApp, CoordinatorToNode, CostNs, DeviceLoad,
-        DevicePlan, Executed, JobFailure, JobTrace, Liveness, NodeHello, NodePlan, NodeToCoordinator, Plan,
-        PlanJob, PlanRequest, RunningJob, WaitReason,
+        DevicePlan, Executed, HeldJob, JobFailure, JobTrace, Liveness, NodeHello, NodePlan,
+        NodeToCoordinator, Plan, PlanJob, PlanRequest, RunningJob, WaitReason,
     },
     program::Content,
     time::Instant,
@@ -143,10 +143,21 @@ fn app_to_coordinator() -> impl Strategy<Value = AppToCoordinator> {
         vec(job(any::<u64>().boxed()), 0..40),
     ];
     let module = option::of(any::<[u8; 32]>().prop_map(ContentHash));
-    let plan = (any::<(u64, u32)>(), jobs_of, requirements(), module, contents()).prop_map(
-        |((batch, task), jobs, needs, module, contents)| {
+    let held = vec((0_u64..3, 0_u16..3, 0_u32..2, any::<(u32, u64)>()), 0..40).prop_map(|mut held| {
+        // The wire groups them.
+        held.sort_by_key(|&(session, device, epoch, _)| (session, device, epoch));
+        let job = |(session, device, epoch, (index, sequence))| HeldJob {
+            index: JobIndex(index),
+            session: NodeSession(session),
+            device: DeviceIndex(device),
+            attempt: Attempt { epoch: Epoch(epoch), sequence },
+        };
+        held.into_iter().map(job).collect::<Vec<HeldJob>>()
+    });
+    let plan = (any::<(u64, u32)>(), jobs_of, requirements(), module, contents(), held).prop_map(
+        |((batch, task), jobs, needs, module, contents, held)| {
             let (batch, task) = (BatchId(batch), TaskId(task));
-            AppToCoordinator::Plan(PlanRequest { batch, task, jobs, needs, module, contents })
+            AppToCoordinator::Plan(PlanRequest { batch, task, jobs, needs, module, contents, held })
         },
     );
     prop_oneof![
@@ -218,11 +229,13 @@ fn trace() -> impl Strategy<Value = JobTrace> {
 }
 
 fn node_to_coordinator() -> impl Strategy<Value = NodeToCoordinator> {
-    let hello = (any::<(u32, u64)>(), "\\PC{0,40}", vec(device_info(), 0..5), contact(), attempts())
-        .prop_map(|((protocol, session), name, devices, contact, inventory)| {
-            let session = NodeSession(session);
-            NodeToCoordinator::Hello(NodeHello { protocol, name, session, devices, contact, inventory })
-        });
+    let identity = (any::<(u32, u64)>(), option::of(any::<u64>()));
+    let hello = (identity, "\\PC{0,40}", vec(device_info(), 0..5), contact(), attempts()).prop_map(
+        |(((protocol, session), node), name, devices, contact, inventory)| {
+            let (session, node) = (NodeSession(session), node.map(NodeId));
+            NodeToCoordinator::Hello(NodeHello { protocol, name, node, session, devices, contact, inventory })
+        },
+    );
     let running = (attempts(), any::<u64>())
         .prop_map(|(jobs, for_ns)| jobs.first().map(|&job| RunningJob { job, for_ns }));
     let load = (any::<u32>(), running).prop_map(|(queued_jobs, running)| DeviceLoad { queued_jobs, running });
@@ -479,6 +492,7 @@ fn what_is_not_allowed_is_refused_by_field() {
             cost_ns,
             needs,
             contents: Vec::new(),
+            held: Vec::new(),
             module: Vec::new(),
         };
         PlanRequest::try_from(request).map(|_| ())
@@ -569,6 +583,7 @@ fn a_plan_of_4096_jobs_is_small() {
         needs: Requirements::ANY_REAL,
         module: None,
         contents: Vec::new(),
+        held: Vec::new(),
     };
     let bytes = v1::PlanRequest::from(request).encoded_len();
     assert!(bytes < 4_200, "{bytes} B for 4,096 jobs");

@@ -336,6 +336,7 @@ mod tests {
                 needs,
                 module: None,
                 contents,
+                held: Vec::new(),
             });
             runs.waits(BatchId(batch), TaskId(0), WaitReason::NoNode, Instant::now());
         }

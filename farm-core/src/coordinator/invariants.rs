@@ -8,7 +8,7 @@ use super::{
     rates::Module,
     steal::MAX_STEALS,
 };
-use crate::id::{AppId, DeviceIndex, JobKey};
+use crate::id::{AppId, Attempt, DeviceIndex, JobKey};
 
 impl CoordinatorMachine {
     /// Asserts what must hold between any two events.
@@ -50,7 +50,8 @@ impl CoordinatorMachine {
                     None => waiting += 1,
                     Some((node, attempt)) => {
                         assert!(attempts.insert(attempt), "I4: {attempt} was issued twice");
-                        assert!(attempt.sequence < self.next_attempt, "I4: {attempt} was never issued");
+                        let next = Attempt { epoch: self.config.epoch, sequence: self.next_attempt };
+                        assert!(attempt < next, "I4: {attempt} was never issued");
                         let booked =
                             self.nodes.get(&node).is_some_and(|node| node.jobs.contains(&key.in_app(*id)));
                         assert!(booked, "I1: {id} {key} is on {node}, which does not know it");
@@ -133,6 +134,11 @@ impl CoordinatorMachine {
                 if app.waiting_job(key, pending.batch).is_some() {
                     assert!(queued.insert((pending.app, key)), "I1: {} {key} is in line twice", pending.app);
                 }
+            }
+        }
+        for (app, key, batch) in self.recovery.awaited() {
+            if self.apps.get(&app).and_then(|app| app.waiting_job(key, batch)).is_some() {
+                assert!(queued.insert((app, key)), "I1: {app} {key} is in line, and waits for its node");
             }
         }
         let waiting: u64 = self.apps.values().map(|app| app.waiting_jobs).sum();

@@ -58,6 +58,7 @@ impl CoordinatorMachine {
         self.expire_steals(now);
         self.expire_questions(now);
         self.open_lanes(now);
+        self.end_recovery(now);
     }
 
     /// Finds the next deadline.
@@ -77,8 +78,8 @@ impl CoordinatorMachine {
         });
         let steals = self.steals.values().map(|steal| Some(steal.answer_by));
         let questions = self.questions.values().map(|asked| Some(asked.answer_by));
-        self.wake =
-            nodes.chain(apps).chain(steals).chain(questions).chain([self.lanes_due()]).flatten().min();
+        let others = [self.lanes_due(), self.recovery.deadline()];
+        self.wake = nodes.chain(apps).chain(steals).chain(questions).chain(others).flatten().min();
     }
 
     fn expire_nodes(&mut self, now: Instant) {

@@ -15,6 +15,7 @@ mod model;
 mod placement;
 pub mod policy;
 mod rates;
+mod recovery;
 mod registry;
 mod replan;
 mod report;
@@ -33,6 +34,7 @@ use self::{
     model::{App, Node, Peer, Pending, Placement},
     policy::{Choice, History, Question, QuestionId},
     rates::Modules,
+    recovery::Recovery,
     steal::{Steal, StealLatency},
     timeline::Record,
 };
@@ -275,6 +277,7 @@ pub struct CoordinatorMachine {
     plugin_faults: BTreeMap<String, PluginFaults>,
     /// Jobs that lost their place during the current event.
     lost: BTreeMap<(AppId, BatchId), Vec<JobKey>>,
+    recovery: Recovery,
     /// Who has large contents, and who brings them where.
     spreads: Spreads,
     /// Retract orders without an answer; at most one for each thief.
@@ -317,6 +320,7 @@ impl CoordinatorMachine {
             next_question: 1,
             plugin_faults: BTreeMap::new(),
             lost: BTreeMap::new(),
+            recovery: Recovery::default(),
             spreads: Spreads::default(),
             steals: BTreeMap::new(),
             next_steal: 1,
@@ -336,6 +340,7 @@ impl CoordinatorMachine {
 
     /// Takes one event in.
     pub fn handle(&mut self, now: Instant, event: Event) {
+        self.begin_recovery(now);
         let speaker = match event {
             Event::FromApp { link, message } => {
                 self.app_said(now, link, message);
@@ -395,7 +400,7 @@ impl CoordinatorMachine {
         self.app_heard(now, app);
         match message {
             AppToCoordinator::Hello(_) => self.protocol_error(now, link),
-            AppToCoordinator::Plan(request) => self.plan_requested(app, request),
+            AppToCoordinator::Plan(request) => self.plan_requested(now, app, request),
             AppToCoordinator::AlreadyDelivered(jobs) => self.already_delivered(app, &jobs),
             AppToCoordinator::Unreachable { node, session } => self.unreachable(now, app, node, session),
             AppToCoordinator::Cancel(task) => self.cancel_task(app, task),

@@ -7,6 +7,7 @@ use super::{
     NodeState,
     policy::Policy,
     rates::{Load, Module, Modules, Throughput},
+    recovery::Brought,
 };
 use crate::{
     device::{DeviceInfo, Requirements},
@@ -164,6 +165,8 @@ pub(super) struct Node {
     pub(super) recheck: Option<Recheck>,
     /// Jobs placed or executed here.
     pub(super) jobs: BTreeSet<JobId>,
+    /// What it holds of earlier coordinators' plans, and its applications have not asked for yet.
+    pub(super) brought: BTreeMap<JobId, Brought>,
     /// Contents that its jobs named: it has them, or will soon.
     contents: BTreeSet<ContentHash>,
     /// It joined and has not stolen yet: it may take jobs of any application.
@@ -186,6 +189,7 @@ impl Node {
             full_until: None,
             recheck: None,
             jobs: BTreeSet::new(),
+            brought: BTreeMap::new(),
             contents: BTreeSet::new(),
             joining: true,
             steal_at: now,

@@ -39,7 +39,7 @@ const MAX_LOAD: u64 = 1 << 50;
 pub(super) const FETCH_NS_PER_BYTE: f64 = 1e9 / 117e6;
 
 impl CoordinatorMachine {
-    pub(super) fn plan_requested(&mut self, id: AppId, request: PlanRequest) {
+    pub(super) fn plan_requested(&mut self, now: Instant, id: AppId, request: PlanRequest) {
         let Some(app) = self.apps.get_mut(&id) else { return };
         if request.jobs.len() > MAX_REQUEST_JOBS || app.jobs.len() + request.jobs.len() > MAX_APP_JOBS {
             let reason = format!(
@@ -58,7 +58,7 @@ impl CoordinatorMachine {
         let Some(app) = self.apps.get_mut(&id) else { return };
         let module = self.modules.named(request.module);
         let intake = take_in(app, &request, module);
-        keys.extend(intake.fresh);
+        keys.extend(self.keep_held(now, id, request.batch, intake.fresh, &request.held));
         if !keys.is_empty() {
             let batch = request.batch;
             self.fresh.push_back(Pending { app: id, batch, answers: Some(batch), keys });
@@ -246,12 +246,7 @@ impl CoordinatorMachine {
             let share = &mut shares[choice.device as usize];
             let attempt = Attempt { epoch: self.config.epoch, sequence: self.next_attempt };
             self.next_attempt += 1;
-            #[expect(
-                clippy::cast_possible_truncation,
-                clippy::cast_sign_loss,
-                reason = "a float cast saturates"
-            )]
-            let load = Load { module: batch.module, amount: (wanted.load as u64).clamp(1, MAX_LOAD) };
+            let load = load_of(batch.module, wanted);
             share.jobs.push(JobAttempt { job: key.in_app(pending.app), attempt });
             share.loads.push(load);
             job.state = JobState::Placed(Placement {
@@ -412,9 +407,16 @@ fn take_in(app: &mut App, request: &PlanRequest, module: Module) -> Intake {
     intake
 }
 
+/// What a job adds to the queue of its device.
+pub(super) fn load_of(module: Module, job: &QuestionJob) -> Load {
+    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a float cast saturates")]
+    let amount = (job.load as u64).clamp(1, MAX_LOAD);
+    Load { module, amount }
+}
+
 /// The jobs of a batch in line that still wait, with their loads: a job of unknown cost counts as much as the mean of
 /// the known ones.
-fn wanted(app: &App, pending: &Pending) -> Vec<QuestionJob> {
+pub(super) fn wanted(app: &App, pending: &Pending) -> Vec<QuestionJob> {
     let mut jobs = Vec::with_capacity(pending.keys.len());
     let mut known = 0_u32;
     let mut sum = 0.0;

@@ -54,7 +54,7 @@ impl CoordinatorMachine {
             self.effects.push_back(Effect::Close { link });
             return;
         }
-        let id = self.node_id(&hello.name);
+        let id = self.node_id(&hello.name, hello.node);
         self.timeline.node_known(id, &hello);
         let same_session = self.nodes.get(&id).map(|node| node.session == hello.session);
         match same_session {
@@ -72,7 +72,7 @@ impl CoordinatorMachine {
         node.link = Some(link);
         node.last_heard = now;
         node.full_until = None;
-        node.contact = hello.contact;
+        node.contact = hello.contact.clone();
         let draining = node.state == NodeState::Draining;
         if !draining {
             node.state = NodeState::Alive;
@@ -91,6 +91,7 @@ impl CoordinatorMachine {
             self.tell_node(id, CoordinatorToNode::Drain);
         }
         self.forget_cache_of(now, id);
+        self.node_brings(now, id, &hello);
         self.reconcile(now, id, &hello.inventory);
         self.retry_stuck();
         tracing::info!(node = %id, name = hello.name, session = %hello.session, "node registered");
@@ -174,7 +175,9 @@ impl CoordinatorMachine {
                     Ok(Admission::Back(app))
                 }
                 Some(known) => Err(format!("{app} {incarnation} is over, {} is there", known.incarnation)),
-                // Its lease ran out, or an earlier coordinator knew it: it keeps its name, its jobs are asked for anew.
+                // An earlier coordinator knew it: it goes on as who it is, and its jobs where they are.
+                None if app.0 != 0 && app.0 <= self.issued_before() => Ok(Admission::New(app, incarnation)),
+                // Its lease ran out: it keeps its name, its jobs are asked for anew.
                 None if self.issued(app) => {
                     Ok(Admission::New(app, AppIncarnation(incarnation.0.saturating_add(1))))
                 }
@@ -289,12 +292,18 @@ impl CoordinatorMachine {
         self.inherit(now, id, &kept);
     }
 
-    fn node_id(&mut self, name: &str) -> NodeId {
+    /// A node's id goes with its name; one that an earlier coordinator gave is kept, so that applications know it still.
+    fn node_id(&mut self, name: &str, earlier: Option<NodeId>) -> NodeId {
         if let Some(&id) = self.names.get(name) {
             return id;
         }
-        let id = NodeId(self.epoch_base() + u64::from(self.next_node));
-        self.next_node += 1;
+        let (issued_before, names) = (self.issued_before(), &self.names);
+        let is_free = |id: &NodeId| id.0 <= issued_before && names.values().all(|taken| taken != id);
+        let id = earlier.filter(is_free).unwrap_or_else(|| {
+            let id = NodeId(issued_before + u64::from(self.next_node));
+            self.next_node += 1;
+            id
+        });
         self.names.insert(name.to_owned(), id);
         id
     }

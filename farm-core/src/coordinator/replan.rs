@@ -93,7 +93,9 @@ impl CoordinatorMachine {
                 None => {
                     left.insert(item.job.app);
                 }
-                Some(_) if !self.answers_for(id, *item) => stale.push(*item),
+                Some(_) if !self.answers_for(id, *item) && !self.may_be_adopted(id, *item) => {
+                    stale.push(*item);
+                }
                 Some(_) => {}
             }
         }

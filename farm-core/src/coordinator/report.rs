@@ -87,6 +87,7 @@ impl CoordinatorMachine {
         }
         // Reports of attempts that were replaced meanwhile change nothing.
         if self.holder(id) != Some((node, attempt)) {
+            self.brought_ended(node, job, failure.as_ref());
             return;
         }
         match failure {
@@ -123,6 +124,9 @@ impl CoordinatorMachine {
 
     fn delivered(&mut self, node: NodeId, job: JobAttempt) {
         if self.holder(job.job) != Some((node, job.attempt)) {
+            if let Some(node) = self.nodes.get_mut(&node) {
+                node.brought.remove(&job.job);
+            }
             return;
         }
         self.forget_job(job.job);

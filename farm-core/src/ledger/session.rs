@@ -6,7 +6,7 @@ use std::{collections::BTreeSet, time::Duration};
 use super::{Effect, Ledger};
 use crate::{
     id::{AppId, AppIncarnation, BatchId, JobId, JobKey},
-    message::{AppHello, AppToCoordinator, CoordinatorToApp, Liveness, PlanJob, PlanRequest},
+    message::{AppHello, AppToCoordinator, CoordinatorToApp, HeldJob, Liveness, PlanJob, PlanRequest},
     program::Content,
     time::Instant,
 };
@@ -175,10 +175,17 @@ impl Ledger {
             self.requested_jobs += u64::from(batch.open_jobs);
         }
         let mut jobs = Vec::with_capacity(batch.indices.len());
+        let mut held = Vec::new();
         let mut contents: BTreeSet<Content> = BTreeSet::new();
         for &index in &batch.indices {
             let Some(job) = self.jobs.get(&JobKey { task: batch.task, index }) else { continue };
             jobs.push(PlanJob { index, cost: job.cost });
+            held.extend(job.place.map(|place| HeldJob {
+                index,
+                session: place.life.session,
+                device: place.device,
+                attempt: place.attempt,
+            }));
             if contents.len() < MAX_REQUEST_CONTENTS {
                 contents.extend(&job.contents);
             }
@@ -188,7 +195,7 @@ impl Ledger {
         }
         let contents = contents.into_iter().take(MAX_REQUEST_CONTENTS).collect();
         let (task, needs, module) = (batch.task, batch.needs, batch.module);
-        let request = PlanRequest { batch: id, task, jobs, needs, module, contents };
+        let request = PlanRequest { batch: id, task, jobs, needs, module, contents, held };
         self.tell_coordinator(AppToCoordinator::Plan(request));
     }
 

@@ -48,6 +48,7 @@ impl WorkerMachine {
         self.tell_coordinator(NodeToCoordinator::Hello(NodeHello {
             protocol: PROTOCOL_VERSION,
             name: self.config.name.clone(),
+            node: self.node,
             session: self.config.session,
             devices: self.config.devices.clone(),
             contact: self.config.contact.clone(),

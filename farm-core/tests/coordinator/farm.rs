@@ -84,6 +84,7 @@ impl Farm {
         };
         let message = NodeToCoordinator::Hello(NodeHello {
             protocol: PROTOCOL_VERSION,
+            node: None,
             name: format!("node {node}"),
             session: NodeSession(node),
             devices: scores.iter().map(device).collect(),
@@ -151,6 +152,7 @@ impl Farm {
             needs: Requirements::ANY,
             module: Some(ContentHash([module; 32])),
             contents: contents.to_vec(),
+            held: Vec::new(),
         };
         self.say(AppToCoordinator::Plan(request))
     }

@@ -12,7 +12,7 @@ use mi_kernel::{
     parse,
 };
 
-use super::{Better, Figure, connect, settled, start_farm, statistics::median};
+use super::{Better, Figure, connect, scaling::LEAST_EFFICIENCY, settled, start_farm, statistics::median};
 use crate::{
     output,
     process_farm::{ProcessFarm, Shape, Stealing},
@@ -29,8 +29,6 @@ const NETWORK_ITERATIONS: u64 = 64;
 const NETWORK_SPEED: f64 = 0.1;
 /// The largest overhead of figure 5.8 in seconds.
 const THESIS_OVERHEAD_S: f64 = 20.8;
-/// As `scaling`: the thesis reaches 31.5 on 32 GPUs.
-const LEAST_EFFICIENCY: f64 = 0.985;
 
 /// What is measured.
 pub(super) struct Setup<'a> {

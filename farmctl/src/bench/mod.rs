@@ -3,6 +3,7 @@
 mod fairness;
 mod jobs;
 mod mi;
+mod recovery;
 mod scaling;
 mod scheduler;
 mod statistics;
@@ -108,6 +109,7 @@ async fn measure(arguments: &BenchArgs) -> anyhow::Result<Vec<Figure>> {
         BenchName::Steal => steal::measure(arguments.seed, runs(5), arguments.pictures.as_deref()).await,
         BenchName::Fairness => fairness::measure(arguments.seed, runs(1)).await,
         BenchName::Scaling => scaling::measure(runs(3)).await,
+        BenchName::Recovery => recovery::measure(runs(1)).await,
         BenchName::Mi => {
             let setup = mi::Setup {
                 set: arguments.set,

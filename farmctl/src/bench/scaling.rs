@@ -28,7 +28,7 @@ const DEVICE_COUNTS: [usize; 6] = [1, 2, 4, 8, 16, 32];
 const NODE_COUNTS: [usize; 4] = [1, 2, 4, 8];
 const DEVICES_PER_NODE: usize = 4;
 /// The thesis reaches 31.5 on 32 GPUs.
-const LEAST_EFFICIENCY: f64 = 0.985;
+pub(super) const LEAST_EFFICIENCY: f64 = 0.985;
 /// Speeds of the nodes of the unequal farm, from slowest to fastest as thesis 5.6.5.
 const UNEQUAL_SPEEDS: [f64; 4] = [1.0, 1.25, 1.5, 1.76];
 

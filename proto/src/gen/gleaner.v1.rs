@@ -1039,6 +1039,28 @@ pub struct PlanRequest {
     /// blake3 of the module that every job's program names first: 32 bytes, or none.
     #[prost(bytes = "vec", tag = "7")]
     pub module: ::prost::alloc::vec::Vec<u8>,
+    /// Where those of the jobs are that have a place, when the request is repeated.
+    #[prost(message, repeated, tag = "8")]
+    pub held: ::prost::alloc::vec::Vec<HeldRun>,
+}
+/// Jobs of a request on one device of one life of a node, planned by one coordinator.
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct HeldRun {
+    /// The life of the node.
+    #[prost(uint64, tag = "1")]
+    pub session: u64,
+    /// The device inside the node, < 65,536.
+    #[prost(uint32, tag = "2")]
+    pub device: u32,
+    /// The epoch that issued the attempts.
+    #[prost(uint32, tag = "3")]
+    pub epoch: u32,
+    /// Each job's index less the one before it (the first: less zero).
+    #[prost(sint64, repeated, tag = "4")]
+    pub index_deltas: ::prost::alloc::vec::Vec<i64>,
+    /// Each attempt's sequence less the one before it, modulo 2^64 (the first: less zero). As many as indices.
+    #[prost(sint64, repeated, tag = "5")]
+    pub sequence_deltas: ::prost::alloc::vec::Vec<i64>,
 }
 /// A node whose data plane cannot be reached from the application.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
@@ -1561,6 +1583,9 @@ pub struct NodeHello {
     /// Attempts the node holds.
     #[prost(message, optional, tag = "6")]
     pub inventory: ::core::option::Option<Attempts>,
+    /// Its id at the coordinator that it was registered with last.
+    #[prost(uint64, optional, tag = "7")]
+    pub node: ::core::option::Option<u64>,
 }
 /// Alive, and how the devices stand.
 #[derive(Clone, PartialEq, ::prost::Message)]

@@ -198,6 +198,11 @@ impl Auditor {
         let before = record.newest.replace((job.attempt, node));
         if let Some((newest, _)) = before {
             assert!(newest <= job.attempt, "I4: {job} is planned after {newest}");
+            // Another coordinator's attempt: it took the job over as it was, and never heard of earlier steals.
+            if newest.epoch < job.attempt.epoch {
+                record.steals = 0;
+                record.left.clear();
+            }
         }
         record.worked_on(worker);
         if self.moving.left > 0 && self.moving.jobs.remove(&job.job) {

@@ -98,6 +98,7 @@ fn farm(devices_per_node: u16) -> CoordinatorMachine {
         };
         let hello = NodeHello {
             protocol: PROTOCOL_VERSION,
+            node: None,
             name: format!("node-{node}"),
             session: NodeSession(node),
             devices: (0..devices_per_node).map(device).collect(),
@@ -136,6 +137,7 @@ fn request_event(app: u64, request: u32) -> Event {
         jobs: jobs.collect(),
         needs: Requirements::ANY,
         contents: Vec::new(),
+        held: Vec::new(),
         module: Some(ContentHash([1; 32])),
     };
     Event::FromApp { link: LinkId(app), message: AppToCoordinator::Plan(request) }

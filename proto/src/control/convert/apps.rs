@@ -9,8 +9,9 @@ use farm_core::{
 };
 
 use super::{
-    MAX_CONTENTS, MAX_ENTRIES, MAX_JOBS, WireError, attempts::IndexColumn, cut, device, enumeration, invalid,
-    list, name, required, text, weight, within,
+    MAX_CONTENTS, MAX_ENTRIES, MAX_JOBS, WireError,
+    attempts::{IndexColumn, held, held_runs},
+    cut, device, enumeration, invalid, list, name, required, text, weight, within,
 };
 use crate::{control::v1, trust::MAX_CAPABILITY_BYTES};
 
@@ -91,6 +92,7 @@ impl From<PlanRequest> for v1::PlanRequest {
             needs: Some(request.needs.into()),
             contents: request.contents.into_iter().map(Into::into).collect(),
             module: request.module.map_or_else(Vec::new, |module| module.0.to_vec()),
+            held: held_runs(&request.held),
         }
     }
 }
@@ -128,6 +130,7 @@ impl TryFrom<v1::PlanRequest> for PlanRequest {
             needs: required("PlanRequest.needs", wire.needs)?.try_into()?,
             contents: list("PlanRequest.contents", MAX_CONTENTS, wire.contents)?,
             module: module(&wire.module)?,
+            held: held(wire.held)?,
         })
     }
 }

@@ -1,6 +1,11 @@
 //! Lists of jobs and attempts as columns of differences: a job of a plan costs about two bytes.
 
-use farm_core::id::{AppId, Attempt, Epoch, JobAttempt, JobId, JobIndex, TaskId};
+use std::collections::BTreeMap;
+
+use farm_core::{
+    id::{AppId, Attempt, DeviceIndex, Epoch, JobAttempt, JobId, JobIndex, NodeSession, TaskId},
+    message::HeldJob,
+};
 
 use super::{MAX_JOBS, WireError, invalid, within};
 use crate::control::v1;
@@ -119,4 +124,45 @@ impl SequenceColumn {
         self.0 = self.0.wrapping_add_signed(delta);
         self.0
     }
+}
+
+/// Grouped by device: the jobs of a request go round over all devices.
+pub(super) fn held_runs(held: &[HeldJob]) -> Vec<v1::HeldRun> {
+    let mut groups: BTreeMap<(NodeSession, DeviceIndex, Epoch), Vec<&HeldJob>> = BTreeMap::new();
+    for job in held {
+        groups.entry((job.session, job.device, job.attempt.epoch)).or_default().push(job);
+    }
+    let runs = groups.into_iter().map(|((session, device, epoch), jobs)| {
+        let mut index = IndexColumn::default();
+        let mut sequence = SequenceColumn::default();
+        v1::HeldRun {
+            session: session.0,
+            device: u32::from(device.0),
+            epoch: epoch.0,
+            index_deltas: jobs.iter().map(|job| index.delta(job.index)).collect(),
+            sequence_deltas: jobs.iter().map(|job| sequence.delta(job.attempt.sequence)).collect(),
+        }
+    });
+    runs.collect()
+}
+
+pub(super) fn held(runs: Vec<v1::HeldRun>) -> Result<Vec<HeldJob>, WireError> {
+    let count = runs.iter().map(|run| run.index_deltas.len()).sum();
+    within("PlanRequest.held", count, MAX_JOBS)?;
+    let mut held = Vec::with_capacity(count);
+    for run in runs {
+        if run.index_deltas.len() != run.sequence_deltas.len() {
+            return Err(invalid("HeldRun.sequence_deltas", format!("{} of them", run.sequence_deltas.len())));
+        }
+        let device = u16::try_from(run.device).map_err(|_| invalid("HeldRun.device", run.device))?;
+        let (session, device, epoch) = (NodeSession(run.session), DeviceIndex(device), Epoch(run.epoch));
+        let mut index = IndexColumn::default();
+        let mut sequence = SequenceColumn::default();
+        for (index_delta, sequence_delta) in run.index_deltas.into_iter().zip(run.sequence_deltas) {
+            let index = index.next("HeldRun.index_deltas", index_delta)?;
+            let attempt = Attempt { epoch, sequence: sequence.next(sequence_delta) };
+            held.push(HeldJob { index, session, device, attempt });
+        }
+    }
+    Ok(held)
 }

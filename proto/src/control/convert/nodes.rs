@@ -103,6 +103,7 @@ impl From<NodeHello> for v1::NodeHello {
             devices: hello.devices.into_iter().map(Into::into).collect(),
             contact: Some(hello.contact.into()),
             inventory: Some(hello.inventory.as_slice().into()),
+            node: hello.node.map(|node| node.0),
         }
     }
 }
@@ -114,6 +115,7 @@ impl TryFrom<v1::NodeHello> for NodeHello {
         Ok(Self {
             protocol: wire.protocol,
             name: name("NodeHello.name", wire.name)?,
+            node: wire.node.map(NodeId),
             session: NodeSession(wire.session),
             devices: list("NodeHello.devices", MAX_ENTRIES, wire.devices)?,
             contact: required("NodeHello.contact", wire.contact)?.try_into()?,
