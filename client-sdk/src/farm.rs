@@ -76,7 +76,7 @@ impl Farm {
     }
 
     async fn register(options: FarmOptions) -> Result<Self, FarmError> {
-        let session = connect_app(&options.coordinator, options.identity.as_ref())
+        let session = connect_app(&options.coordinator, options.identity.as_ref(), &[])
             .await
             .map_err(|error| connect_error(&options, error))?;
         let (driver, inputs) = DriverHandle::new();

@@ -19,6 +19,8 @@ const EARLIER_FILE: &str = "audit.1.ndjson";
 const MAX_BYTES: u64 = 16 << 20;
 /// Most refusals written in a second; further ones are counted.
 const REFUSALS_PER_SECOND: u64 = 20;
+/// As much of a refusal's reason is written, in characters: some repeat what a stranger has said.
+const MAX_REASON_CHARS: usize = 512;
 
 /// Appends to the log.
 #[derive(Debug)]
@@ -61,6 +63,7 @@ impl Audit {
         }
         log.refusals += 1;
         if log.refusals <= REFUSALS_PER_SECOND {
+            let reason = reason.chars().take(MAX_REASON_CHARS).collect::<String>();
             let line =
                 json!({ "time_s": now_s(), "event": "refused", "what": what, "who": who, "reason": reason });
             log.append(&line, false);

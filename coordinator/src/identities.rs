@@ -1,8 +1,8 @@
 //! What members of a secured farm may say as whom: a node its own name, an application its own earlier life; and the
-//! capabilities that applications show to nodes.
+//! capabilities that applications show to nodes, and to the coordinator when they come back.
 
 use std::{
-    collections::{BTreeMap, HashMap},
+    collections::HashMap,
     time::{Duration, Instant},
 };
 
@@ -10,21 +10,17 @@ use farm_core::{
     id::{AppId, AppIncarnation, Epoch, LinkId},
     message::{AppToCoordinator, CoordinatorToApp, NodeToCoordinator},
 };
-use proto::trust::Principal;
+use proto::trust::{Capability, Member};
 
 use crate::security::{CAPABILITY_LIFETIME, Gate};
 
 /// A capability of this age is followed by a new one.
 const RENEW_AFTER: Duration = CAPABILITY_LIFETIME.checked_div(2).expect("two is not zero");
-/// Applications whose owner is known, at most; beyond it the earliest is forgotten.
-const MAX_OWNERS: usize = 65_536;
 
 /// Who said which hello.
 #[derive(Debug)]
 pub(crate) struct Identities {
     gate: Gate,
-    /// Of this coordinator's life. An application that resumes after a restart is believed: nobody else knows its number.
-    owners: BTreeMap<AppId, Principal>,
     /// The capability given on a connection.
     given: HashMap<LinkId, Given>,
 }
@@ -39,48 +35,50 @@ struct Given {
 
 impl Identities {
     pub(crate) fn new(gate: Gate) -> Self {
-        Self { gate, owners: BTreeMap::new(), given: HashMap::new() }
+        Self { gate, given: HashMap::new() }
+    }
+
+    /// Whether somebody let in is no member any more.
+    pub(crate) fn is_out(&self, member: Option<&Member>) -> bool {
+        member.is_some_and(|member| !self.gate.is_member(member))
     }
 
     /// # Errors
-    /// It resumes somebody else's application.
+    /// It resumes an application and does not show that it is its own: a coordinator's word, of this life or an earlier one.
     pub(crate) fn check_app(
         &self,
-        member: Option<&Principal>,
+        member: Option<&Member>,
+        shown: Option<&Capability>,
         message: &AppToCoordinator,
     ) -> Result<(), String> {
         let (Some(member), AppToCoordinator::Hello(hello)) = (member, message) else { return Ok(()) };
-        let owner = hello.resume.and_then(|resumed| self.owners.get(&resumed.0));
-        if owner.is_none_or(|owner| owner == member) {
+        let Some((app, _)) = hello.resume else { return Ok(()) };
+        if shown.is_some_and(|shown| shown.app == app) {
             return Ok(());
         }
-        Err(self.refused(
-            "resume an application",
-            member,
-            format!("{member} resumes somebody else's application"),
-        ))
+        let reason = format!("{} does not show that {app} is its own", member.principal);
+        Err(self.refused("resume an application", member, reason))
     }
 
     /// # Errors
     /// It calls itself by another's name.
     pub(crate) fn check_node(
         &self,
-        member: Option<&Principal>,
+        member: Option<&Member>,
         message: &NodeToCoordinator,
     ) -> Result<(), String> {
         let (Some(member), NodeToCoordinator::Hello(hello)) = (member, message) else { return Ok(()) };
-        if member.may_be_called(&hello.name) {
+        let principal = &member.principal;
+        if principal.may_be_called(&hello.name) {
             return Ok(());
         }
-        let reason = format!(
-            "{member} may be called {:?} or \"{}/ANYTHING\", not {:?}",
-            member.name, member.name, hello.name
-        );
+        let own = &principal.name;
+        let reason = format!("{principal} may be called {own:?} or \"{own}/ANYTHING\", not {:?}", hello.name);
         Err(self.refused("register a node", member, reason))
     }
 
-    fn refused(&self, what: &str, member: &Principal, reason: String) -> String {
-        self.gate.refused(what, member, &reason);
+    fn refused(&self, what: &str, member: &Member, reason: String) -> String {
+        self.gate.refused(what, &member.principal, &reason);
         reason
     }
 
@@ -88,16 +86,12 @@ impl Identities {
     pub(crate) fn capability(
         &mut self,
         link: LinkId,
-        member: &Principal,
+        member: &Member,
         message: &CoordinatorToApp,
     ) -> Option<Vec<u8>> {
         let Gate::Members(security) = &self.gate else { return None };
         let given = match (message, self.given.get_mut(&link)) {
             (&CoordinatorToApp::Welcome { app, incarnation, epoch, .. }, _) => {
-                self.owners.insert(app, member.clone());
-                if self.owners.len() > MAX_OWNERS {
-                    self.owners.pop_first();
-                }
                 self.given.insert(link, Given { app, incarnation, epoch, at: Instant::now() });
                 self.given.get(&link)?
             }
@@ -107,7 +101,7 @@ impl Identities {
             }
             _ => return None,
         };
-        security.capability(given.app, given.incarnation, member, given.epoch)
+        security.capability(given.app, given.incarnation, &member.principal, given.epoch)
     }
 
     pub(crate) fn forget(&mut self, link: LinkId) {

@@ -57,6 +57,8 @@ pub struct CoordinatorOptions {
     pub state: Option<PathBuf>,
     /// Whether members of the farm alone are let in, by the authority in the state directory.
     pub secured: bool,
+    /// Whether everyone is let in though the state directory knows of members.
+    pub insecure: bool,
     /// Timings told to nodes and applications.
     pub liveness: Liveness,
     /// How long a vanished application keeps its jobs, in milliseconds.
@@ -72,6 +74,7 @@ impl Default for CoordinatorOptions {
             http: SocketAddr::from(([127, 0, 0, 1], 7701)),
             state: None,
             secured: false,
+            insecure: false,
             liveness: Liveness::default(),
             app_lease_ms: 30_000,
             plugins: None,
@@ -202,6 +205,12 @@ pub async fn start(options: CoordinatorOptions) -> Result<CoordinatorHandle, Sta
     let mut store = options.state.as_deref().map(Store::open).transpose()?;
     let epoch = store.as_ref().map_or_else(|| Ok(epoch_by_the_clock()), Store::begin_epoch)?;
     let gate = match (options.secured, &options.state) {
+        (false, _) if !options.insecure && store.as_ref().is_some_and(Store::has_members) => {
+            return Err(StartError::Trust(format!(
+                "the state directory knows of members, but its {AUTHORITY_FILE} cannot be found: restore it, or secure the farm \
+                 anew with `farmctl init`, or let everyone in with --insecure"
+            )));
+        }
         (false, _) => Gate::Open,
         (true, Some(directory)) => {
             let store = store.take().ok_or_else(|| StartError::Trust("no control store".to_owned()))?;
@@ -255,12 +264,12 @@ async fn listen(what: &'static str, address: SocketAddr) -> Result<(TcpListener,
 
 async fn serve_grpc(incoming: Incoming, owner: OwnerHandle, gate: Gate, mut stop: watch::Receiver<()>) {
     use proto::control::{admin_server, apps_server, nodes_server, server, trust_server};
-    let sessions = Sessions::new(owner, gate.clone());
+    let sessions = Sessions::new(owner.clone(), gate.clone());
     let served = server()
         .add_service(apps_server(sessions.clone()))
         .add_service(nodes_server(sessions.clone()))
         .add_service(admin_server(sessions))
-        .add_service(trust_server(TrustService::new(gate)))
+        .add_service(trust_server(TrustService::new(gate, owner)))
         .serve_with_incoming_shutdown(incoming, async move {
             // The error is the signal: the handle is gone.
             let _ = stop.changed().await;

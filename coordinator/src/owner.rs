@@ -13,7 +13,7 @@ use farm_core::{
     message::{AppToCoordinator, CoordinatorToApp, CoordinatorToNode, NodeToCoordinator},
     time::Instant,
 };
-use proto::trust::Principal;
+use proto::trust::{Capability, Member};
 use tokio::{
     sync::{mpsc, oneshot},
     time,
@@ -51,6 +51,8 @@ pub(crate) enum Command {
     Drain(NodeId, oneshot::Sender<bool>),
     /// Asks what ran when and where.
     Timeline(TimelineQuery, oneshot::Sender<Timeline>),
+    /// Somebody is no member any more, or under another key: its sessions end.
+    MembersChanged,
 }
 
 /// The owner's end of one connection. Dropping it ends the session after what is queued.
@@ -60,16 +62,19 @@ pub(crate) struct Peer<M> {
     /// Tells the session's reader to stop; dropped with the peer.
     _alive: oneshot::Sender<()>,
     /// Who it is, in a secured farm.
-    member: Option<Principal>,
+    member: Option<Member>,
+    /// What an application that comes back has shown.
+    shown: Option<Capability>,
 }
 
 impl<M> Peer<M> {
     pub(crate) const fn new(
         outbound: mpsc::Sender<Result<M, Status>>,
         alive: oneshot::Sender<()>,
-        member: Option<Principal>,
+        member: Option<Member>,
+        shown: Option<Capability>,
     ) -> Self {
-        Self { outbound, _alive: alive, member }
+        Self { outbound, _alive: alive, member, shown }
     }
 
     /// False if the peer does not read or is gone.
@@ -146,7 +151,7 @@ impl Owner {
             // What a peer said before its connection was closed here has no one to answer to.
             Command::FromApp(link, message) => {
                 let Some(peer) = self.apps.get(&link) else { return };
-                match self.identities.check_app(peer.member.as_ref(), &message) {
+                match self.identities.check_app(peer.member.as_ref(), peer.shown.as_ref(), &message) {
                     Ok(()) => self.machine.handle(now, Event::FromApp { link, message }),
                     Err(reason) => self.refuse(now, link, reason),
                 }
@@ -161,6 +166,18 @@ impl Owner {
             Command::Closed(link) => {
                 if self.forget(link) {
                     self.machine.handle(now, Event::LinkClosed { link });
+                }
+            }
+            Command::MembersChanged => {
+                let apps = self.apps.iter().map(|(&link, peer)| (link, peer.member.as_ref()));
+                let nodes = self.nodes.iter().map(|(&link, peer)| (link, peer.member.as_ref()));
+                let out: Vec<LinkId> = apps
+                    .chain(nodes)
+                    .filter(|(_, member)| self.identities.is_out(*member))
+                    .map(|(link, _)| link)
+                    .collect();
+                for link in out {
+                    self.refuse(now, link, "this membership is over".to_owned());
                 }
             }
             // An asker that went away needs no answer.
@@ -275,6 +292,12 @@ impl OwnerHandle {
         timeline.await.ok()
     }
 
+    /// Ends the sessions of those who are no members any more.
+    pub(crate) async fn members_changed(&self) {
+        // An owner that has stopped has no sessions.
+        let _ = self.0.send(Command::MembersChanged).await;
+    }
+
     /// Waits until the owner has stopped.
     pub(crate) async fn stopped(&self) {
         self.0.closed().await;
@@ -309,7 +332,7 @@ mod tests {
                 resume: None,
             };
             let said = [
-                Command::AppOpened(link, Peer::new(outbound, alive, None)),
+                Command::AppOpened(link, Peer::new(outbound, alive, None, None)),
                 Command::FromApp(link, AppToCoordinator::Hello(hello)),
                 Command::FromApp(link, AppToCoordinator::Heartbeat { sequence: 1 }),
             ];

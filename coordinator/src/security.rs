@@ -24,6 +24,7 @@ use tonic::{Extensions, Request, Response, Status};
 use crate::{
     StartError,
     audit::Audit,
+    owner::OwnerHandle,
     store::{Store, StoreError, Token},
 };
 
@@ -124,6 +125,31 @@ impl Gate {
         }
     }
 
+    /// Whether somebody is a member under this key still; a store that cannot be read says so.
+    pub(crate) fn is_member(&self, member: &Member) -> bool {
+        match self {
+            Self::Open => true,
+            Self::Members(security) => security.store.is_member(member).unwrap_or(true),
+        }
+    }
+
+    /// The capability that an application shows when it comes back, if it is one of its own.
+    pub(crate) fn capability_of(
+        &self,
+        member: Option<&Member>,
+        shown: Option<&[u8]>,
+    ) -> Result<Option<Capability>, Status> {
+        let (Self::Members(security), Some(member), Some(shown)) = (self, member, shown) else {
+            return Ok(None);
+        };
+        let checked = Capability::check(shown, &security.identity, &member.principal, SystemTime::now());
+        checked.map(Some).map_err(|error| {
+            let reason = error.to_string();
+            self.refused("resume an application", &member.principal, &reason);
+            Status::permission_denied(reason)
+        })
+    }
+
     /// Writes down what a member did.
     pub(crate) fn done(&self, what: &str, member: Option<&Member>, details: serde_json::Value) {
         if let (Self::Members(security), Some(member)) = (self, member) {
@@ -215,11 +241,12 @@ impl Security {
 #[derive(Clone, Debug)]
 pub(crate) struct TrustService {
     gate: Gate,
+    owner: OwnerHandle,
 }
 
 impl TrustService {
-    pub(crate) const fn new(gate: Gate) -> Self {
-        Self { gate }
+    pub(crate) const fn new(gate: Gate, owner: OwnerHandle) -> Self {
+        Self { gate, owner }
     }
 
     fn security(&self) -> Result<&Arc<Security>, Status> {
@@ -325,6 +352,7 @@ impl Trust for TrustService {
         })
         .await?;
         if was {
+            self.owner.members_changed().await;
             Ok(Response::new(v1::ExpelResponse {}))
         } else {
             Err(Status::not_found(format!("there is no member {uri}")))
@@ -341,6 +369,8 @@ impl Trust for TrustService {
         }
         let asked = request.into_inner();
         let joined = on_disk(move || security.join(&asked, &caller.address.to_string())).await?;
+        // Somebody else may have had the name.
+        self.owner.members_changed().await;
         Ok(Response::new(wire(joined)))
     }
 
@@ -427,14 +457,16 @@ pub fn initialise(state: &Path, farm: &str, operator: &str) -> Result<Identity, 
     check_name("operator", operator).map_err(trust)?;
     let store = Store::open(state)?;
     let path: PathBuf = state.join(AUTHORITY_FILE);
-    if path.exists() {
+    if path.symlink_metadata().is_ok() {
         let reason =
             "the farm is secured already; remove the file to begin anew: every member has to join again";
         return Err(StartError::State { path, reason: reason.to_owned() });
     }
+    let fault = |error: StoreError| StartError::State { path: path.clone(), reason: error.to_string() };
+    // Members and tokens of an authority that was here before are none of the new one's.
+    store.clear().map_err(fault)?;
     let authority = Authority::create(farm).map_err(trust)?;
     let identity = authority.identity(Role::Operator, operator, IDENTITY_LIFETIME).map_err(trust)?;
-    let fault = |error: StoreError| StartError::State { path: path.clone(), reason: error.to_string() };
     store.admit(&identity.member().map_err(trust)?).map_err(fault)?;
     authority.write(&path).map_err(trust)?;
     Ok(identity)

@@ -15,7 +15,7 @@ use farm_core::{
     message::{AppToCoordinator, CoordinatorToApp, CoordinatorToNode, NodeToCoordinator},
 };
 use proto::control::{
-    WireError,
+    CAPABILITY_METADATA, WireError,
     v1::{self, admin_server::Admin, apps_server::Apps, nodes_server::Nodes},
 };
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc, oneshot};
@@ -63,7 +63,9 @@ impl Sessions {
         Out: Send + 'static,
         Wire: Send + 'static,
     {
-        let member = self.gate.admit(request.extensions(), action)?.map(|member| member.principal);
+        let member = self.gate.admit(request.extensions(), action)?;
+        let shown = request.metadata().get_bin(CAPABILITY_METADATA).and_then(|value| value.to_bytes().ok());
+        let shown = self.gate.capability_of(member.as_ref(), shown.as_deref())?;
         let messages = request.into_inner();
         let Ok(slot) = Arc::clone(&self.slots).try_acquire_owned() else {
             return Err(Status::resource_exhausted(format!("{MAX_SESSIONS} sessions are open already")));
@@ -71,7 +73,7 @@ impl Sessions {
         let link = LinkId(self.next_link.fetch_add(1, Ordering::Relaxed));
         let (outbound, outgoing) = mpsc::channel(QUEUED_MESSAGES);
         let (alive, ended) = oneshot::channel();
-        if !self.owner.send(opened(link, Peer::new(outbound.clone(), alive, member))).await {
+        if !self.owner.send(opened(link, Peer::new(outbound.clone(), alive, member, shown))).await {
             return Err(Status::unavailable("the coordinator stops"));
         }
         let reader = Reader { link, owner: self.owner.clone(), outbound, ended, _slot: slot };

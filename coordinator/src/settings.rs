@@ -134,7 +134,10 @@ pub(crate) fn options(arguments: Arguments) -> anyhow::Result<CoordinatorOptions
     Ok(CoordinatorOptions {
         listen,
         http,
-        secured: !insecure && state.as_ref().is_some_and(|state| state.join(AUTHORITY_FILE).exists()),
+        // One that is there and cannot be read is an error later, not a farm without members.
+        secured: !insecure
+            && state.as_ref().is_some_and(|state| state.join(AUTHORITY_FILE).symlink_metadata().is_ok()),
+        insecure,
         state,
         liveness: liveness(arguments.liveness, &file.liveness)?,
         app_lease_ms: file.app_lease_ms.unwrap_or(defaults.app_lease_ms),

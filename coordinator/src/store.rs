@@ -5,6 +5,7 @@
 
 use std::{
     fs, io,
+    ops::Not as _,
     path::{Path, PathBuf},
     time::SystemTime,
 };
@@ -259,15 +260,43 @@ impl Store {
         Ok(known.is_some_and(|key| key.value() == member.key))
     }
 
-    /// Ends a membership; whether it was one. Certificates live on, and are worth nothing here.
+    /// Ends a membership, and takes back the tokens that this member has made; whether it was one. Certificates live on, and
+    /// are worth nothing here. The last operator stays: nobody else could make another.
     pub(crate) fn expel(&self, principal: &Principal) -> Result<bool, StoreError> {
+        let uri = principal.to_string();
         let transaction = self.database.begin_write().map_err(broken)?;
         let was = {
             let mut members = transaction.open_table(MEMBERS).map_err(broken)?;
-            members.remove(principal.to_string().as_str()).map_err(broken)?.is_some()
+            let mut operators = 0;
+            for entry in members.iter().map_err(broken)? {
+                let (member, _) = entry.map_err(broken)?;
+                operators += usize::from(is_operator(member.value()));
+            }
+            if operators == 1 && is_operator(&uri) {
+                return Err(StoreError::Denied(format!(
+                    "{uri} is the only operator: make another one first"
+                )));
+            }
+            let mut tokens = transaction.open_table(TOKENS).map_err(broken)?;
+            tokens.retain(|_, text| parse(text).is_ok_and(|token| token.maker != uri)).map_err(broken)?;
+            members.remove(uri.as_str()).map_err(broken)?.is_some()
         };
         transaction.commit().map_err(broken)?;
         Ok(was)
+    }
+
+    /// Whether the farm that this is the store of was ever secured.
+    pub(crate) fn has_members(&self) -> bool {
+        // One that cannot be read is no reason to let everyone in.
+        self.members().is_ok_and(|members| members.is_empty()).not()
+    }
+
+    /// Forgets members and tokens.
+    pub(crate) fn clear(&self) -> Result<(), StoreError> {
+        let transaction = self.database.begin_write().map_err(broken)?;
+        transaction.open_table(TOKENS).map_err(broken)?.retain(|_, _| false).map_err(broken)?;
+        transaction.open_table(MEMBERS).map_err(broken)?.retain(|_, _| false).map_err(broken)?;
+        transaction.commit().map_err(broken)
     }
 
     /// The URIs of all members, in order.
@@ -296,6 +325,10 @@ fn enrol(
     }
     members.insert(uri.as_str(), member.key.as_slice()).map_err(broken)?;
     Ok(())
+}
+
+fn is_operator(uri: &str) -> bool {
+    uri.parse().is_ok_and(|principal: Principal| principal.role == Role::Operator)
 }
 
 fn digest(secret: &[u8]) -> [u8; 32] {

@@ -30,7 +30,7 @@ async fn farm() -> (CoordinatorHandle, String) {
 }
 
 async fn app(address: &str, protocol: u32) -> AppSession {
-    let session = control::connect_app(address, None).await.unwrap();
+    let session = control::connect_app(address, None, &[]).await.unwrap();
     let hello = AppHello {
         protocol,
         name: "an app".to_owned(),

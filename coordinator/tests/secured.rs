@@ -47,6 +47,10 @@ impl Farm {
         start(CoordinatorOptions { state, secured: true, ..CoordinatorOptions::embedded() }).await.unwrap()
     }
 
+    fn fingerprint(state: &TempDir) -> [u8; 32] {
+        Authority::read(&state.path().join("authority.pem")).unwrap().fingerprint()
+    }
+
     fn audit(&self) -> String {
         fs::read_to_string(self.state.path().join("audit.ndjson")).unwrap()
     }
@@ -99,7 +103,7 @@ async fn each_role_may_do_what_the_matrix_says_and_nothing_else() {
             is_denied(control::revoke_token(address, who, 999).await),
             is_denied(control::list_members(address, who).await),
             is_denied(control::expel(address, who, "gleaner://farm/app/nobody").await),
-            is_denied(control::connect_app(address, who).await),
+            is_denied(control::connect_app(address, who, &[]).await),
             is_denied(control::connect_node(address, who).await),
             is_denied(renewed),
         ];
@@ -211,40 +215,97 @@ fn app_hello(resume: Option<(AppId, AppIncarnation)>) -> AppToCoordinator {
 }
 
 type AppSession = Session<AppToCoordinator, CoordinatorToApp>;
+type Who = (AppId, AppIncarnation);
 
-/// The session, and who the application is. Before the welcome comes what it shows to nodes.
-async fn app(address: &str, identity: &Identity) -> (AppSession, (AppId, AppIncarnation)) {
-    let mut session = control::connect_app(address, Some(identity)).await.unwrap();
-    session.sender.try_send(app_hello(None)).unwrap();
-    let first = session.receiver.recv().await.unwrap();
-    assert!(matches!(first, CoordinatorToApp::Capability(_)), "got {first:?}");
-    match session.receiver.recv().await.unwrap() {
-        CoordinatorToApp::Welcome { app, incarnation, .. } => (session, (app, incarnation)),
-        other => panic!("got {other:?}"),
-    }
+/// An application's session, who it is, and what it was given to show. It may come back as somebody.
+async fn app(
+    address: &str,
+    identity: &Identity,
+    resume: Option<Who>,
+    shown: &[u8],
+) -> Result<(AppSession, Who, Vec<u8>), SessionError> {
+    let mut session = control::connect_app(address, Some(identity), shown).await?;
+    session.sender.try_send(app_hello(resume)).unwrap();
+    let CoordinatorToApp::Capability(given) = session.receiver.recv().await? else {
+        panic!("before the welcome comes what is to be shown")
+    };
+    let CoordinatorToApp::Welcome { app, incarnation, .. } = session.receiver.recv().await? else {
+        panic!("then comes the welcome")
+    };
+    Ok((session, (app, incarnation), given))
 }
 
+/// The hostile test of 2026-11-26: numbers of applications are no secret, and a coordinator that had forgotten, or never known, who
+/// had one gave it to the first who said it.
 #[tokio::test(flavor = "multi_thread")]
 async fn nobody_goes_on_as_somebody_elses_application() {
     let farm = Farm::start().await;
     let other = join(&farm.address, &farm.operator, Role::App, "other").await;
-    let (session, who) = app(&farm.address, &farm.app).await;
-    let mut thief = control::connect_app(&farm.address, Some(&other)).await.unwrap();
-    thief.sender.try_send(app_hello(Some(who))).unwrap();
-    assert!(is_denied(thief.receiver.recv().await));
+    let (session, who, given) = app(&farm.address, &farm.app, None, &[]).await.unwrap();
+    let (others, _, others_own) = app(&farm.address, &other, None, &[]).await.unwrap();
+    drop(others);
+    for shown in [&[][..], &given, &others_own, b"nonsense"] {
+        assert!(is_denied(app(&farm.address, &other, Some(who), shown).await), "showing {} B", shown.len());
+    }
     let status = control::status(&farm.address, Some(&farm.operator)).await.unwrap();
-    assert_eq!(status.apps.len(), 1, "nothing came of it");
-    assert!(status.apps[0].connected, "and its owner's session stands");
+    let connected = status.apps.iter().find(|app| app.app == who.0).unwrap().connected;
+    assert!(connected, "its owner's session stands");
     drop(session);
-    // The owner may.
-    let mut resumed = control::connect_app(&farm.address, Some(&farm.app)).await.unwrap();
-    resumed.sender.try_send(app_hello(Some(who))).unwrap();
-    assert!(matches!(resumed.receiver.recv().await, Ok(CoordinatorToApp::Capability(_))));
+    let (_, back, _) = app(&farm.address, &farm.app, Some(who), &given).await.unwrap();
+    assert_eq!(back.0, who.0, "the owner may");
+    assert!(farm.audit().contains("does not show that app-1 is its own"), "{}", farm.audit());
+
+    let Farm { state, handle, app: owner, .. } = farm;
+    handle.shutdown().await;
+    let handle = Farm::coordinator(&state).await;
+    let address = handle.grpc_addr().to_string();
+    for shown in [&[][..], &given, &others_own] {
+        assert!(
+            is_denied(app(&address, &other, Some(who), shown).await),
+            "after a restart, {} B",
+            shown.len()
+        );
+    }
+    let (_, back, _) = app(&address, &owner, Some(who), &given).await.unwrap();
+    assert_eq!(back.0, who.0, "the earlier coordinator's word still counts");
+    handle.shutdown().await;
+}
+
+/// The hostile test of 2026-11-26, further findings.
+#[tokio::test(flavor = "multi_thread")]
+async fn who_is_out_is_out_at_once_and_so_is_whom_they_invited() {
+    let farm = Farm::start().await;
+    let second = join(&farm.address, &farm.operator, Role::Operator, "second").await;
+    let by_second = token(&farm.address, &second, &invitation(Role::Operator, None)).await;
+    let (mut session, ..) = app(&farm.address, &farm.app, None, &[]).await.unwrap();
+    let operator = Some(&farm.operator);
+    for member in [&farm.app, &second] {
+        control::expel(&farm.address, operator, &member.principal().to_string()).await.unwrap();
+    }
+    assert!(is_denied(session.receiver.recv().await), "an open session ends");
     assert!(
-        matches!(resumed.receiver.recv().await, Ok(CoordinatorToApp::Welcome { app, .. }) if app == who.0)
+        is_denied(control::join(&farm.address, &by_second, Some("third")).await),
+        "its tokens are taken back"
     );
-    assert!(farm.audit().contains("resumes somebody else's application"));
-    farm.handle.shutdown().await;
+    let last = control::expel(&farm.address, operator, &farm.operator.principal().to_string()).await;
+    assert!(is_denied(last), "the last operator stays");
+
+    let old_token = token(&farm.address, &farm.operator, &invitation(Role::Operator, None)).await;
+    let Farm { state, handle, operator, .. } = farm;
+    handle.shutdown().await;
+    fs::remove_file(state.path().join("authority.pem")).unwrap();
+    let options =
+        || CoordinatorOptions { state: Some(state.path().to_owned()), ..CoordinatorOptions::embedded() };
+    let error = start(options()).await.unwrap_err().to_string();
+    assert!(error.contains("authority.pem"), "a farm with members does not become open by itself: {error}");
+    start(CoordinatorOptions { insecure: true, ..options() }).await.unwrap().shutdown().await;
+    initialise(state.path(), "farm", "anew").unwrap();
+    let handle = Farm::coordinator(&state).await;
+    let address = handle.grpc_addr().to_string();
+    assert!(is_denied(control::status(&address, Some(&operator)).await));
+    let secret_known = JoinToken { authority: Farm::fingerprint(&state), ..old_token };
+    assert!(is_denied(control::join(&address, &secret_known, Some("old")).await), "another farm's token");
+    handle.shutdown().await;
 }
 
 #[tokio::test(flavor = "multi_thread")]

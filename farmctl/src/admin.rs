@@ -50,7 +50,7 @@ impl Admin {
     /// Makes a join token; gives its number, too.
     pub(crate) async fn create_token(&self, invitation: &Invitation) -> Result<(u64, JoinToken), Failure> {
         let (address, identity) = self.to();
-        control::create_token(address, identity, invitation).await.map_err(failure)
+        control::create_token(address, identity, invitation).await.map_err(usage)
     }
 
     /// The tokens that can still be used.
@@ -74,7 +74,15 @@ impl Admin {
     /// Ends a membership.
     pub(crate) async fn expel(&self, uri: &str) -> Result<(), Failure> {
         let (address, identity) = self.to();
-        control::expel(address, identity, uri).await.map_err(failure)
+        control::expel(address, identity, uri).await.map_err(usage)
+    }
+}
+
+/// A request that is refused for what it says is a wrong usage.
+fn usage(error: SessionError) -> Failure {
+    match error {
+        SessionError::Refused { .. } => Failure::Usage(error.into()),
+        error => failure(error),
     }
 }
 

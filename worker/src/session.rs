@@ -22,6 +22,8 @@ pub(crate) type NodeLink = Session<NodeToCoordinator, CoordinatorToNode>;
 const FIRST_PAUSE: Duration = Duration::from_millis(100);
 /// Longest pause between tries.
 const LONGEST_PAUSE: Duration = Duration::from_secs(2);
+/// Pause after the farm did not let this node in any more.
+const DENIED_PAUSE: Duration = Duration::from_secs(30);
 /// How often the node looks whether its certificate is to be renewed.
 const RENEWAL_CHECK: Duration = Duration::from_secs(3_600);
 
@@ -63,7 +65,11 @@ pub(crate) async fn again(coordinator: String, identity: Option<Identity>, input
                 let _ = inputs.send(Input::Connected(session)).await;
                 return;
             }
-            Err(error @ SessionError::Denied { .. }) => tracing::warn!(%error, "trying again"),
+            Err(error @ SessionError::Denied { .. }) => {
+                tracing::warn!(%error, "trying again");
+                // Only an operator changes that.
+                sleep(DENIED_PAUSE).await;
+            }
             Err(error) => tracing::debug!(%error, "trying again"),
         }
         pause = (pause * 2).min(LONGEST_PAUSE);
@@ -73,14 +79,15 @@ pub(crate) async fn again(coordinator: String, identity: Option<Identity>, input
 /// Renews the node's certificate in time, for as long as it is polled.
 pub(crate) async fn stay_valid(coordinator: String, identity: Identity) {
     loop {
+        if identity.renew_at() <= SystemTime::now() {
+            match renew(&coordinator, &identity).await {
+                Ok(()) => tracing::info!("the node's certificate is renewed"),
+                Err(error) => {
+                    tracing::warn!(%error, "the node's certificate could not be renewed, trying again")
+                }
+            }
+        }
         sleep(RENEWAL_CHECK).await;
-        if SystemTime::now() < identity.renew_at() {
-            continue;
-        }
-        match renew(&coordinator, &identity).await {
-            Ok(()) => tracing::info!("the node's certificate is renewed"),
-            Err(error) => tracing::warn!(%error, "the node's certificate could not be renewed, trying again"),
-        }
     }
 }
 

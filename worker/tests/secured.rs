@@ -140,7 +140,7 @@ async fn a_node_lets_in_whom_the_coordinator_vouches_for() {
     }
 
     // What an application of this farm shows, if it is what the coordinator gave, is enough; all else is not.
-    let mut session = control::connect_app(&farm.address, Some(&app)).await.unwrap();
+    let mut session = control::connect_app(&farm.address, Some(&app), &[]).await.unwrap();
     let hello = farm_core::message::AppHello {
         protocol: PROTOCOL_VERSION,
         name: "app".to_owned(),

@@ -3,6 +3,7 @@
 
 use std::time::{Duration, Instant};
 
+use bytes::Bytes;
 use farm_core::message::AppToCoordinator;
 use proto::{
     control::{SessionError, SessionReceiver, SessionSender, connect_app},
@@ -20,6 +21,8 @@ const LONGEST_BACK_OFF: Duration = Duration::from_secs(3);
 pub(super) struct Coordinator {
     address: String,
     identity: Option<Identity>,
+    /// By which a secured farm knows the application when it comes back.
+    capability: Bytes,
     reconnect_timeout: Duration,
     inputs: mpsc::Sender<Input>,
     /// Number of the newest session.
@@ -60,7 +63,20 @@ impl Coordinator {
         reconnect_timeout: Duration,
         inputs: mpsc::Sender<Input>,
     ) -> Self {
-        Self { address, identity, reconnect_timeout, inputs, serial: 0, state: State::Trying, loss: None }
+        Self {
+            address,
+            identity,
+            capability: Bytes::new(),
+            reconnect_timeout,
+            inputs,
+            serial: 0,
+            state: State::Trying,
+            loss: None,
+        }
+    }
+
+    pub(super) fn keep(&mut self, capability: Bytes) {
+        self.capability = capability;
     }
 
     pub(super) const fn is_current(&self, serial: u64) -> bool {
@@ -135,9 +151,9 @@ impl Coordinator {
         if matches!(self.state, State::BackingOff { until } if until <= now) {
             self.state = State::Trying;
             let (address, identity) = (self.address.clone(), self.identity.clone());
-            let inputs = self.inputs.clone();
+            let (inputs, capability) = (self.inputs.clone(), self.capability.clone());
             tokio::spawn(async move {
-                let outcome = connect_app(&address, identity.as_ref()).await;
+                let outcome = connect_app(&address, identity.as_ref(), &capability).await;
                 // Without an owner task nobody wants the session.
                 let _ = inputs.send(Input::CoordinatorTried(outcome)).await;
             });

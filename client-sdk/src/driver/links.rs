@@ -101,8 +101,8 @@ impl Links {
     }
 
     /// From now on nodes are shown this.
-    pub(super) fn show(&mut self, capability: Vec<u8>) {
-        self.capability = capability.into();
+    pub(super) fn show(&mut self, capability: Bytes) {
+        self.capability = capability;
     }
 
     /// Links that stand.

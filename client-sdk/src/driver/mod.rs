@@ -314,6 +314,8 @@ impl Driver {
 
     fn coordinator_said(&mut self, message: CoordinatorToApp) {
         if let CoordinatorToApp::Capability(bytes) = message {
+            let bytes = Bytes::from(bytes);
+            self.coordinator.keep(bytes.clone());
             self.links.show(bytes);
             return;
         }

@@ -1,7 +1,8 @@
 //! `farmctl init`, `join`, `token ...` and `member ...`: who belongs to a secured farm.
 
 use std::{
-    fs, io,
+    fs,
+    io::{self, Write as _},
     path::Path,
     time::{Duration, SystemTime},
 };
@@ -21,6 +22,8 @@ use crate::{
     target::Target,
 };
 
+/// As many bytes an identity has at most.
+const IDENTITY_BYTES: usize = 4_096;
 /// Longest token that is read, in bytes.
 const MAX_TOKEN_BYTES: u64 = 4_096;
 
@@ -104,16 +107,25 @@ fn read_token() -> io::Result<String> {
 fn check_writable(file: &Path) -> Result<(), Failure> {
     let folder =
         file.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or_else(|| Path::new("."));
+    if file.is_dir() {
+        return Err(Failure::Usage(anyhow!("{} is a folder, not a file for an identity", file.display())));
+    }
+    // As much as an identity, for a full disk is found out by writing.
     let probe = folder.join(format!(".gleaner-probe-{}", std::process::id()));
-    fs::create_dir_all(folder)
-        .and_then(|()| fs::write(&probe, b""))
-        .and_then(|()| fs::remove_file(&probe))
-        .with_context(|| format!("{} cannot be written", file.display()))?;
+    let probed = fs::create_dir_all(folder).and_then(|()| {
+        let mut written = fs::File::create(&probe)?;
+        written.write_all(&[b' '; IDENTITY_BYTES])?;
+        written.sync_all()
+    });
+    let removed = fs::remove_file(&probe);
+    probed.and(removed).with_context(|| format!("{} cannot be written", file.display()))?;
     Ok(())
 }
 
 /// Writes an identity; one that is there already is moved out of the way.
 fn keep(identity: &Identity, file: &Path) -> Result<(), Failure> {
+    let draft = file.with_extension("pem.joined");
+    identity.write(&draft)?;
     if file.exists() {
         let mut names = (1_u32..).map(|number| file.with_extension(format!("{number}.pem")));
         let earlier =
@@ -122,7 +134,10 @@ fn keep(identity: &Identity, file: &Path) -> Result<(), Failure> {
             .with_context(|| format!("{} cannot be kept as {}", file.display(), earlier.display()))?;
         tell!("farmctl: the identity that was there is kept as {}", earlier.display());
     }
-    Ok(identity.write(file)?)
+    fs::rename(&draft, file).with_context(|| {
+        format!("your identity is {}; it cannot be moved to {}", draft.display(), file.display())
+    })?;
+    Ok(())
 }
 
 /// Runs one of the verbs of tokens.

@@ -32,8 +32,8 @@ pub use self::{
     },
     incoming::Incoming,
     session::{
-        Heard, QUEUED_MESSAGES, Session, SessionError, SessionReceiver, SessionSender, connect_app,
-        connect_node, drain, status, timeline,
+        CAPABILITY_METADATA, Heard, QUEUED_MESSAGES, Session, SessionError, SessionReceiver, SessionSender,
+        connect_app, connect_node, drain, status, timeline,
     },
     stream::{Caller, ControlStream},
     transport::{

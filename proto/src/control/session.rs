@@ -13,13 +13,16 @@ use farm_core::{
 use thiserror::Error;
 use tokio::sync::mpsc;
 use tokio_stream::{StreamExt, wrappers::ReceiverStream};
-use tonic::{Code, Request, Status, Streaming, transport::Channel};
+use tonic::{Code, Request, Status, Streaming, metadata::MetadataValue, transport::Channel};
 
 use super::{
     ADMIN_TIMEOUT, MAX_MESSAGE_BYTES, WireError, transport,
     v1::{self, admin_client::AdminClient, apps_client::AppsClient, nodes_client::NodesClient},
 };
 use crate::{tls, trust::Identity};
+
+/// Where an application that comes back shows its capability.
+pub const CAPABILITY_METADATA: &str = "gleaner-capability-bin";
 
 /// Messages that wait to be sent on a session, at most.
 pub const QUEUED_MESSAGES: usize = 1_024;
@@ -157,20 +160,26 @@ fn is_denial(status: &Status) -> bool {
     matches!(status.code(), Code::Unauthenticated | Code::PermissionDenied)
 }
 
-/// Opens an application's session with the coordinator at `HOST:PORT`, as a member of a secured farm if an identity is given. The hello is the caller's first message.
+/// Opens an application's session with the coordinator at `HOST:PORT`, as a member of a secured farm if an identity is given. There,
+/// an application that comes back shows the capability that it was given before; empty: none. The hello is the caller's first message.
 ///
 /// # Errors
 /// Nobody answers within [`ADMIN_TIMEOUT`].
 pub async fn connect_app(
     coordinator: &str,
     identity: Option<&Identity>,
+    capability: &[u8],
 ) -> Result<Session<AppToCoordinator, CoordinatorToApp>, SessionError> {
     let mut client = AppsClient::new(channel(coordinator, identity).await?)
         .max_decoding_message_size(MAX_MESSAGE_BYTES)
         .max_encoding_message_size(MAX_MESSAGE_BYTES);
     let (sender, queue) = mpsc::channel(QUEUED_MESSAGES);
     let outgoing = ReceiverStream::new(queue).map(v1::AppToCoordinator::from);
-    let answer = within_timeout(coordinator, client.session(outgoing)).await?;
+    let mut request = Request::new(outgoing);
+    if !capability.is_empty() {
+        request.metadata_mut().insert_bin(CAPABILITY_METADATA, MetadataValue::from_bytes(capability));
+    }
+    let answer = within_timeout(coordinator, client.session(request)).await?;
     Ok(Session { sender: SessionSender(sender), receiver: SessionReceiver(answer.into_inner()) })
 }
 
@@ -273,7 +282,10 @@ pub(super) async fn within_timeout<T>(
         Err(_) => Err(unreachable(format!("no answer within {ADMIN_TIMEOUT:?}"))),
         Ok(Ok(answer)) => Ok(answer),
         Ok(Err(status))
-            if matches!(status.code(), Code::NotFound | Code::InvalidArgument | Code::FailedPrecondition) =>
+            if matches!(
+                status.code(),
+                Code::NotFound | Code::InvalidArgument | Code::FailedPrecondition | Code::Internal
+            ) =>
         {
             Err(SessionError::Refused { reason: status.message().to_owned() })
         }

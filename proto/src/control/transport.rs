@@ -14,8 +14,9 @@ use super::{SessionError, v1};
 pub const ADMIN_TIMEOUT: Duration = Duration::from_secs(5);
 /// Most bytes of one message, in either direction.
 pub const MAX_MESSAGE_BYTES: usize = 16 << 20;
-/// Most bytes of one message to the service that strangers may speak to: a signing request has half a kilobyte.
-const MAX_TRUST_MESSAGE_BYTES: usize = 64 << 10;
+/// Most bytes of one request outside of sessions: it is read before its sender is asked who it is, and a signing request, the
+/// largest, has half a kilobyte.
+const MAX_REQUEST_BYTES: usize = 16 << 10;
 /// What clients call the coordinator in the handshake.
 const COORDINATOR_NAME: &str = "gleaner-coordinator";
 /// HTTP/2 pings go this often (off by default).
@@ -57,14 +58,14 @@ pub fn nodes_server<N: v1::nodes_server::Nodes>(nodes: N) -> v1::nodes_server::N
 /// The service of operators, with message caps.
 pub fn admin_server<A: v1::admin_server::Admin>(admin: A) -> v1::admin_server::AdminServer<A> {
     v1::admin_server::AdminServer::new(admin)
-        .max_decoding_message_size(MAX_MESSAGE_BYTES)
+        .max_decoding_message_size(MAX_REQUEST_BYTES)
         .max_encoding_message_size(MAX_MESSAGE_BYTES)
 }
 
 /// The service of members and those who become one, with message caps.
 pub fn trust_server<T: v1::trust_server::Trust>(trust: T) -> v1::trust_server::TrustServer<T> {
     v1::trust_server::TrustServer::new(trust)
-        .max_decoding_message_size(MAX_TRUST_MESSAGE_BYTES)
+        .max_decoding_message_size(MAX_REQUEST_BYTES)
         .max_encoding_message_size(MAX_MESSAGE_BYTES)
 }
 

@@ -5,7 +5,7 @@ use std::time::Duration;
 use tonic::{Request, transport::Channel};
 
 use super::{
-    SessionError, WireError,
+    MAX_MESSAGE_BYTES, SessionError, WireError,
     session::{channel, within_timeout},
     transport,
     v1::{self, trust_client::TrustClient},
@@ -142,7 +142,7 @@ pub async fn renew(coordinator: &str, identity: &Identity) -> Result<(), Session
 }
 
 fn client(channel: Channel) -> TrustClient<Channel> {
-    TrustClient::new(channel)
+    TrustClient::new(channel).max_decoding_message_size(MAX_MESSAGE_BYTES)
 }
 
 fn membership(wire: v1::Membership) -> Membership {

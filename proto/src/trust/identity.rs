@@ -217,7 +217,6 @@ impl Current {
     ) -> Result<Self, TrustError> {
         let wrong = |reason: &dyn fmt::Display| TrustError::Invalid(format!("the certificate: {reason}"));
         let certificate = CertificateDer::from(certificate.to_vec());
-        verify::signed_by(&certificate, authority, SystemTime::now()).map_err(|error| wrong(&error))?;
         let (not_before, not_after) = {
             let (_, parsed) = X509Certificate::from_der(&certificate).map_err(|error| wrong(&error))?;
             if parsed.public_key().subject_public_key.data.as_ref() != key.public_key_raw() {
@@ -227,6 +226,10 @@ impl Current {
             let validity = parsed.validity();
             (seconds(validity.not_before.timestamp()), seconds(validity.not_after.timestamp()))
         };
+        // Of its own time: one that is over says so when it is used, and is told from one that never was.
+        let at = unix_seconds(SystemTime::now()).clamp(not_before, not_after.max(not_before));
+        verify::signed_by(&certificate, authority, SystemTime::UNIX_EPOCH + Duration::from_secs(at))
+            .map_err(|error| wrong(&error))?;
         let private = PrivateKeyDer::try_from(key.serialize_der()).map_err(|error| wrong(&error))?;
         let signer = any_ecdsa_type(&private).map_err(|error| wrong(&error))?;
         let certified = Arc::new(CertifiedKey::new(vec![certificate, authority.clone()], signer));

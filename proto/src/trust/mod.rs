@@ -89,6 +89,9 @@ fn unix_seconds(time: SystemTime) -> u64 {
 fn read_text(path: &Path) -> Result<String, TrustError> {
     let fault = |source| TrustError::File { path: path.to_owned(), source };
     let metadata = fs::metadata(path).map_err(fault)?;
+    if !metadata.is_file() {
+        return Err(TrustError::garbled(path, "is not a file"));
+    }
     if metadata.len() > MAX_FILE_BYTES {
         return Err(TrustError::garbled(path, format!("is over {MAX_FILE_BYTES} B")));
     }
@@ -102,7 +105,7 @@ fn write_secret(path: &Path, text: &str) -> Result<(), TrustError> {
         path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or_else(|| Path::new("."));
     fs::create_dir_all(folder).map_err(fault)?;
     let mut draft = path.as_os_str().to_owned();
-    draft.push(".new");
+    draft.push(format!(".new-{}", std::process::id()));
     let draft = PathBuf::from(draft);
     let write = || {
         let _ = fs::remove_file(&draft);
@@ -112,5 +115,9 @@ fn write_secret(path: &Path, text: &str) -> Result<(), TrustError> {
         fs::rename(&draft, path)?;
         fs::File::open(folder)?.sync_all()
     };
-    write().map_err(fault)
+    write().map_err(|error| {
+        // A half of it is of no use.
+        let _ = fs::remove_file(&draft);
+        fault(error)
+    })
 }

@@ -54,9 +54,10 @@ impl FromStr for Role {
     type Err = TrustError;
 
     fn from_str(text: &str) -> Result<Self, TrustError> {
-        Self::ALL.into_iter().find(|role| role.word() == text).ok_or_else(|| {
-            TrustError::Invalid(format!("{text:?} is no role: coordinator, node, app or operator"))
-        })
+        Self::ALL
+            .into_iter()
+            .find(|role| role.word() == text)
+            .ok_or_else(|| TrustError::Invalid("a role is coordinator, node, app or operator".to_owned()))
     }
 }
 
@@ -81,7 +82,8 @@ impl FromStr for Principal {
     type Err = TrustError;
 
     fn from_str(uri: &str) -> Result<Self, TrustError> {
-        let wrong = || TrustError::Invalid(format!("{uri:?} is not {SCHEME}FARM/ROLE/NAME"));
+        let shown = || uri.chars().take(4 * MAX_NAME_BYTES).collect::<String>();
+        let wrong = || TrustError::Invalid(format!("{:?} is not {SCHEME}FARM/ROLE/NAME", shown()));
         let mut parts = uri.strip_prefix(SCHEME).ok_or_else(wrong)?.split('/');
         let (Some(farm), Some(role), Some(name), None) =
             (parts.next(), parts.next(), parts.next(), parts.next())
@@ -143,6 +145,7 @@ impl Member {
 pub fn check_name(what: &str, name: &str) -> Result<(), TrustError> {
     let allowed = |byte: u8| byte.is_ascii_alphanumeric() || matches!(byte, b'.' | b'_' | b'-');
     if name.is_empty() || name.len() > MAX_NAME_BYTES || !name.bytes().all(allowed) {
+        let name = name.chars().take(MAX_NAME_BYTES).collect::<String>();
         return Err(TrustError::Invalid(format!(
             "{what} {name:?} is not 1 to {MAX_NAME_BYTES} letters, digits, '.', '_' or '-'"
         )));
