@@ -24,12 +24,13 @@ const SEEDS: [(&str, &[u64]); 4] = [
     // seen by thieves. 47121, 68965, 71353, 73278: contents out of reach for two seconds failed their jobs. Of the simulator:
     // 35007, 47627: a job that was planned anew after its end was said to be stolen too often. 20267: before any job was
     // completed queues were taken for so short that nothing was worth a steal. 24543: all nodes waited for a content to come to
-    // one whose application was gone.
+    // one whose application was gone. 1083, 10071: a coordinator that takes over what its predecessor planned knows nothing of
+    // earlier steals, nor of plans that never left the predecessor.
     (
         "weather",
         &[
-            78, 165, 305, 2_376, 5_330, 6_521, 10_284, 13_445, 17_727, 18_944, 20_267, 24_543, 35_007,
-            47_121, 47_627, 68_965, 71_353, 73_278,
+            78, 165, 305, 1_083, 2_376, 5_330, 6_521, 10_071, 10_284, 13_445, 17_727, 18_944, 20_267, 24_543,
+            35_007, 47_121, 47_627, 68_965, 71_353, 73_278,
         ],
     ),
     // 17, 48, 143: an application that resumed without its memory was not told of jobs that had been executed, threw

@@ -135,11 +135,18 @@ pub struct Auditor {
     fair: BTreeSet<usize>,
     thorough: bool,
     settled: usize,
+    /// Of the coordinator that speaks.
+    epoch: u32,
     /// What was there to be judged.
     pub checks: Checks,
 }
 
 impl Auditor {
+    /// Another coordinator speaks.
+    pub(super) fn coordinator_began(&mut self, epoch: u32) {
+        self.epoch = epoch;
+    }
+
     /// Has the machines check their own books after every single event.
     pub fn be_thorough(&mut self) {
         self.thorough = true;
@@ -196,13 +203,15 @@ impl Auditor {
     fn placed(&mut self, job: JobAttempt, node: NodeId, worker: usize) {
         let record = self.jobs.entry(job.job).or_default();
         let before = record.newest.replace((job.attempt, node));
+        // Not planned but taken over, as node and application say it is: of later attempts, which never left the coordinator
+        // before this one, nobody knows, nor of earlier steals.
+        let taken_over = job.attempt.epoch.0 < self.epoch;
+        if taken_over || before.is_some_and(|(newest, _)| newest.epoch < job.attempt.epoch) {
+            record.steals = 0;
+            record.left.clear();
+        }
         if let Some((newest, _)) = before {
-            assert!(newest <= job.attempt, "I4: {job} is planned after {newest}");
-            // Another coordinator's attempt: it took the job over as it was, and never heard of earlier steals.
-            if newest.epoch < job.attempt.epoch {
-                record.steals = 0;
-                record.left.clear();
-            }
+            assert!(taken_over || newest <= job.attempt, "I4: {job} is planned after {newest}");
         }
         record.worked_on(worker);
         if self.moving.left > 0 && self.moving.jobs.remove(&job.job) {

@@ -66,6 +66,7 @@ impl World {
             return;
         }
         self.coordinator_up = true;
+        self.audit.coordinator_began(self.store.epoch);
         self.coordinator_clock = self.new_clock();
         self.coordinator = self.store.coordinator(self.store.epoch.into(), self.setup.max_crashes);
         self.rearm(Proc::Coordinator);
