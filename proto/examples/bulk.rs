@@ -28,10 +28,10 @@ const LEAST_OF_QUINN: f64 = 0.9;
 
 #[tokio::main]
 async fn main() -> Outcome<()> {
-    let mut arguments = env::args().skip(1).map(|text| text.parse::<usize>());
+    let mut arguments = env::args().skip(1).map(|text| text.parse::<u16>());
     let mebibytes = arguments.next().transpose()?.unwrap_or(512);
     let rounds = arguments.next().transpose()?.unwrap_or(5).max(1);
-    let bytes: Bytes = (0..mebibytes << 18).flat_map(|number| (number as u32).to_le_bytes()).collect();
+    let bytes: Bytes = (0..u32::from(mebibytes) << 18).flat_map(u32::to_le_bytes).collect();
 
     let content = ContentCopy::prepare(&bytes).await?;
     let quinn = QuinnCopy::prepare().await?;

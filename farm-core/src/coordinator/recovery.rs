@@ -18,6 +18,9 @@ use crate::{
     time::Instant,
 };
 
+/// Where jobs of one batch are: node, device, attempt.
+type Places = BTreeMap<JobKey, (NodeId, DeviceIndex, Attempt)>;
+
 /// A job that its application says is on a node that is not back yet.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Awaited {
@@ -83,11 +86,13 @@ impl CoordinatorMachine {
         let sessions: BTreeMap<NodeSession, NodeId> =
             self.nodes.iter().map(|(&id, node)| (node.session, id)).collect();
         let waits = self.recovery.until.is_some_and(|until| now < until);
-        let (mut here, mut others) = (BTreeMap::new(), Vec::new());
+        let (mut here, mut others) = (Places::new(), Vec::new());
         for key in fresh {
             match held.get(&key) {
                 Some(job) => match sessions.get(&job.session) {
-                    Some(&node) => drop(here.insert(key, (node, job.device, job.attempt))),
+                    Some(&node) => {
+                        here.insert(key, (node, job.device, job.attempt));
+                    }
                     None if waits => {
                         let awaited = Awaited { batch, device: job.device, attempt: job.attempt };
                         self.recovery.awaited.entry(job.session).or_default().insert((app, key), awaited);
@@ -117,8 +122,7 @@ impl CoordinatorMachine {
         let Some(node) = self.nodes.get_mut(&id) else { return };
         node.brought = brought;
         let awaited = self.recovery.awaited.remove(&hello.session).unwrap_or_default();
-        let mut batches: BTreeMap<(AppId, BatchId), BTreeMap<JobKey, (NodeId, DeviceIndex, Attempt)>> =
-            BTreeMap::new();
+        let mut batches: BTreeMap<(AppId, BatchId), Places> = BTreeMap::new();
         for ((app, key), awaited) in awaited {
             let place = (id, awaited.device, awaited.attempt);
             batches.entry((app, awaited.batch)).or_default().insert(key, place);
@@ -168,13 +172,7 @@ impl CoordinatorMachine {
     }
 
     /// Gives jobs the places that they have already; gives back those that their nodes do not hold, and that still wait.
-    fn adopt(
-        &mut self,
-        now: Instant,
-        id: AppId,
-        batch: BatchId,
-        jobs: BTreeMap<JobKey, (NodeId, DeviceIndex, Attempt)>,
-    ) -> Vec<JobKey> {
+    fn adopt(&mut self, now: Instant, id: AppId, batch: BatchId, jobs: Places) -> Vec<JobKey> {
         let pending = Pending { app: id, batch, answers: None, keys: jobs.keys().copied().collect() };
         let Some(app) = self.apps.get(&id) else { return Vec::new() };
         let Some(module) = app.batches.get(&batch).map(|batch| batch.module) else { return Vec::new() };
