@@ -125,7 +125,7 @@ impl Gate {
         }
     }
 
-    /// Whether somebody is a member under this key still; a store that cannot be read says so.
+    /// Whether somebody is a member under this key still; a store that cannot be read ends nobody's session.
     pub(crate) fn is_member(&self, member: &Member) -> bool {
         match self {
             Self::Open => true,
