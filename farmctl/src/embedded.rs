@@ -4,7 +4,7 @@
 use anyhow::Context as _;
 use coordinator::{CoordinatorHandle, CoordinatorOptions};
 use gpu_exec::DeviceSpec;
-use worker::{WorkerHandle, WorkerOptions};
+use worker::{Isolation, WorkerHandle, WorkerOptions};
 
 use crate::{
     failure::Failure,
@@ -41,7 +41,10 @@ impl EmbeddedFarm {
         let specs = device_specs(devices)?;
         let coordinator =
             coordinator::start(options).await.context("the coordinator of the own farm does not start")?;
-        let options = WorkerOptions::embedded(coordinator.grpc_addr().to_string(), specs);
+        let options = WorkerOptions {
+            isolation: Isolation::own_binary(),
+            ..WorkerOptions::embedded(coordinator.grpc_addr().to_string(), specs)
+        };
         match worker::start(options).await {
             Ok(worker) => Ok(Self { coordinator, worker }),
             Err(error) => {

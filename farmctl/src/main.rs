@@ -33,13 +33,16 @@ use crate::{
 };
 
 fn main() -> ExitCode {
-    let cli = Cli::parse();
     // Logs are for the one who asks (RUST_LOG): a command's own words are its output and its error.
     tracing_subscriber::fmt()
         .with_env_filter(EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new("error")))
         .with_writer(std::io::stderr)
         .log_internal_errors(false)
         .init();
+    if let Some(code) = worker::serve_if_executor(std::env::args_os()) {
+        return code;
+    }
+    let cli = Cli::parse();
     match run(&cli) {
         Ok(()) => ExitCode::SUCCESS,
         Err(failure) => {

@@ -1,14 +1,13 @@
 //! The executor's interface, the same for real and simulated devices.
 //!
-//! It owns no device itself: it hands orders to [`crate::real`] or [`crate::sim`]. A later executor in a subprocess of
-//! its own is a third variant behind the same four calls.
+//! It owns no device itself: it hands orders to [`crate::real`] or [`crate::sim`].
 
 use std::{sync::Arc, time::Duration};
 
 use bytes::Bytes;
 use farm_core::{
     device::DeviceInfo,
-    id::{ContentHash, DeviceIndex, JobAttempt},
+    id::{ContentHash, JobAttempt},
     message::{JobFailure, LatencyClass},
     program::JobProgram,
 };
@@ -20,8 +19,39 @@ use crate::{
     spec::DeviceSpec,
 };
 
-/// The callback that events go to.
-pub(crate) type EventSink = Box<dyn Fn(ExecutorEvent) + Send + Sync>;
+/// Whom an executor works for. A closure that takes events is one.
+///
+/// All calls come from the device's thread (a simulated device: [`Self::event`] also from inside [`Executor::submit`] and
+/// [`Executor::abort`]).
+pub trait Host: Send + Sync + 'static {
+    /// Something happened. Must not block.
+    fn event(&self, event: ExecutorEvent);
+
+    /// A job is about to be prepared: its modules are compiled and its bytes uploaded. If the driver takes the process
+    /// down now, this job or a running one is the cause.
+    fn preparing(&self, _job: JobAttempt) {}
+
+    /// The bytes of a content that neither the order nor the device has. May block, for a bounded time.
+    fn content(&self, _hash: &ContentHash) -> Option<Bytes> {
+        None
+    }
+}
+
+impl<F: Fn(ExecutorEvent) + Send + Sync + 'static> Host for F {
+    fn event(&self, event: ExecutorEvent) {
+        self(event);
+    }
+}
+
+/// What becomes of a device whose work does not end when it should.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum HungDevice {
+    /// It is left behind, with its memory, and opened anew.
+    Reopened,
+    /// It is lost at once, and jobs that have not begun are not reported: whoever owns the process ends it, which frees
+    /// what the driver holds, and tries them again in a new one.
+    Lost,
+}
 
 /// Most devices of one node: what [`DeviceIndex`] and a status screen can hold.
 pub(crate) const MAX_DEVICES: usize = 256;
@@ -36,7 +66,8 @@ pub struct Order {
     /// What to do.
     pub program: Arc<JobProgram>,
     /// The bytes of every module and task allocation that the program names, in any order. A name that is missing
-    /// here fails the job with [`JobFailure::ContentUnavailable`], unless the device still holds it.
+    /// here, that the device does not hold either and that [`Host::content`] cannot give, fails the job with
+    /// [`JobFailure::ContentUnavailable`].
     pub contents: Vec<(ContentHash, Bytes)>,
     /// How long the job may run, from `Started`, interruptions not counted.
     pub limit: Duration,
@@ -98,6 +129,8 @@ pub struct ExecutorConfig {
     pub max_pipelines: usize,
     /// What a submit of work should take at most; sliced launches are cut to it.
     pub submit_target: Duration,
+    /// What becomes of a hung device.
+    pub hung_device: HungDevice,
 }
 
 impl Default for ExecutorConfig {
@@ -110,6 +143,7 @@ impl Default for ExecutorConfig {
             max_pipelines: 256,
             // 30-programs-and-data.md section 4: a submit stays below 50 ms; half of it leaves room for variance.
             submit_target: Duration::from_millis(25),
+            hung_device: HungDevice::Reopened,
         }
     }
 }
@@ -130,24 +164,17 @@ enum Device {
 impl Executor {
     /// Opens a device, measures its score and starts its executor.
     ///
-    /// `on_event` is called from the device's thread (a simulated device: also from inside [`Self::submit`] and
-    /// [`Self::abort`]); it must not block.
-    ///
     /// # Errors
     /// There is no such device, it cannot be opened, or `spec` is [`DeviceSpec::All`].
-    pub fn start(
-        spec: &DeviceSpec,
-        config: ExecutorConfig,
-        on_event: impl Fn(ExecutorEvent) + Send + Sync + 'static,
-    ) -> Result<Self, OpenError> {
+    pub fn start(spec: &DeviceSpec, config: ExecutorConfig, host: impl Host) -> Result<Self, OpenError> {
         match spec {
             DeviceSpec::All => Err(OpenError::NotSingle { spec: *spec }),
             DeviceSpec::Gpu(_) | DeviceSpec::Cpu => {
-                let (device, info) = RealDevice::start(*spec, config, Box::new(on_event))?;
+                let (device, info) = RealDevice::start(*spec, config, Box::new(host))?;
                 Ok(Self { info, device: Device::Real(device) })
             }
             DeviceSpec::Sim(sim) => {
-                let (device, info) = SimDevice::start(*sim, Box::new(on_event))?;
+                let (device, info) = SimDevice::start(*sim, Box::new(host))?;
                 Ok(Self { info, device: Device::Sim(device) })
             }
         }
@@ -198,21 +225,4 @@ pub fn expand(specs: &[DeviceSpec]) -> Result<Vec<DeviceSpec>, OpenError> {
         return Err(OpenError::TooMany { count: devices.len(), most: MAX_DEVICES });
     }
     Ok(devices)
-}
-
-/// Opens every device of `specs`, one after the other, `all` expanded; events carry the device's index in the answer.
-///
-/// # Errors
-/// The first device that cannot be opened.
-pub fn open(
-    specs: &[DeviceSpec],
-    config: ExecutorConfig,
-    on_event: impl Fn(DeviceIndex, ExecutorEvent) + Send + Sync + 'static,
-) -> Result<Vec<Executor>, OpenError> {
-    let on_event = Arc::new(on_event);
-    let start = |(index, spec): (u16, &DeviceSpec)| {
-        let on_event = Arc::clone(&on_event);
-        Executor::start(spec, config, move |event| on_event(DeviceIndex(index), event))
-    };
-    (0..).zip(&expand(specs)?).map(start).collect()
 }

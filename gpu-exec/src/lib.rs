@@ -1,8 +1,8 @@
 //! Executors of job programs. The only crate that names wgpu.
 //!
 //! It owns devices (a wgpu adapter, or a simulated one), pipelines, device memory, readback and measured device time.
-//! It never sees a network, a scheduler or a disk: orders come in by [`Executor::submit`], events go out by the
-//! callback given at the start.
+//! It never sees a network, a scheduler or a disk: orders come in by [`Executor::submit`], events go out to the
+//! [`Host`] given at the start.
 //!
 //! What a kernel's author has to know of lavapipe (Mesa 22.3, found by measurement): an invocation's loops run at most
 //! 65,535 rounds *in all, nested ones together*; then every loop ends early, without any error. Kernels that need more
@@ -28,7 +28,7 @@ mod spec;
 
 pub use self::{
     error::{Busy, OpenError},
-    executor::{Executor, ExecutorConfig, ExecutorEvent, Order, expand, open},
+    executor::{Executor, ExecutorConfig, ExecutorEvent, Host, HungDevice, Order, expand},
     real::{Adapter, enumerate},
     spec::{DeviceSpec, SimSpec, SpecError},
 };

@@ -23,7 +23,7 @@ use farm_core::{
 
 use crate::{
     error::{Busy, OpenError},
-    executor::{DEPTH, EventSink, ExecutorEvent, Order},
+    executor::{DEPTH, ExecutorEvent, Host, Order},
     spec::{DeviceSpec, SimSpec},
 };
 
@@ -36,7 +36,7 @@ pub(crate) struct SimDevice {
 /// submitter's own call, and the state is touched for well under a microsecond at a time.
 struct Shared {
     spec: SimSpec,
-    on_event: EventSink,
+    host: Box<dyn Host>,
     state: Mutex<State>,
 }
 
@@ -73,7 +73,7 @@ struct Running {
 }
 
 impl SimDevice {
-    pub(crate) fn start(spec: SimSpec, on_event: EventSink) -> Result<(Self, DeviceInfo), OpenError> {
+    pub(crate) fn start(spec: SimSpec, host: Box<dyn Host>) -> Result<(Self, DeviceInfo), OpenError> {
         timer::ensure().map_err(|source| OpenError::Thread { spec: DeviceSpec::Sim(spec), source })?;
         let info = DeviceInfo {
             name: format!("simulated (speed {})", spec.speed),
@@ -85,7 +85,7 @@ impl SimDevice {
                 .union(Features::TIMESTAMP),
             limits: Limits::UNBOUNDED,
         };
-        let shared = Arc::new(Shared { spec, on_event, state: Mutex::default() });
+        let shared = Arc::new(Shared { spec, host, state: Mutex::default() });
         Ok((Self { shared }, info))
     }
 
@@ -234,7 +234,7 @@ impl Shared {
         state.emitting = true;
         while let Some(event) = state.outbox.pop_front() {
             drop(state);
-            (self.on_event)(event);
+            self.host.event(event);
             state = self.lock();
         }
         state.emitting = false;

@@ -14,7 +14,7 @@ use farm_core::{
     message::{CostNs, JobFailure, LatencyClass},
     program::{Content, JobProgram},
 };
-use gpu_exec::{Busy, DeviceSpec, Executor, ExecutorConfig, ExecutorEvent, Order, open};
+use gpu_exec::{Busy, DeviceSpec, Executor, ExecutorConfig, ExecutorEvent, Order};
 
 /// Far more than any test needs; it only turns a hang into a failure.
 const PATIENCE: Duration = Duration::from_secs(60);
@@ -184,8 +184,14 @@ fn the_next_job_may_be_submitted_from_inside_the_callback() {
 fn many_devices_share_one_timer() {
     let (sender, events) = mpsc::channel();
     let specs = vec!["sim:speed=1".parse().unwrap(); 32];
-    let on_event = move |device, event| drop(sender.send((device, event)));
-    let executors = open(&specs, ExecutorConfig::default(), on_event).unwrap();
+    let executors: Vec<Executor> = (0..)
+        .zip(&specs)
+        .map(|(index, spec): (u32, _)| {
+            let sender = sender.clone();
+            let on_event = move |event: ExecutorEvent| drop(sender.send((index, event)));
+            Executor::start(spec, ExecutorConfig::default(), on_event).unwrap()
+        })
+        .collect();
     for (index, executor) in (0..).zip(&executors) {
         executor.submit(order(index, costing(CostNs(1_000_000)))).unwrap();
     }
@@ -193,8 +199,8 @@ fn many_devices_share_one_timer() {
     while ends.iter().sum::<u32>() < 32 {
         let (device, event) = events.recv_timeout(PATIENCE).expect("an event");
         if let ExecutorEvent::Finished { job: ended, .. } = event {
-            assert_eq!(ended, job(u32::from(device.0)), "on its own device");
-            ends[usize::from(device.0)] += 1;
+            assert_eq!(ended, job(device), "on its own device");
+            ends[usize::try_from(device).unwrap()] += 1;
         }
     }
     assert_eq!(ends, vec![1; 32]);

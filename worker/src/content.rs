@@ -122,11 +122,6 @@ impl ContentCache {
         self.entries.insert(hash, Entry { size_bytes, last_use: 0, pinned: true });
         Ok(())
     }
-
-    /// The bytes of a content that is here.
-    pub(crate) fn get(&self, hash: &ContentHash) -> Option<Bytes> {
-        self.shelf.get(hash)
-    }
 }
 
 #[cfg(test)]
@@ -150,8 +145,8 @@ mod tests {
         cache.release(a);
         cache.insert(c, c_bytes, |hash| evicted.push(hash)).unwrap();
         assert_eq!(evicted, [b], "whoever announces contents is told");
-        assert!(cache.get(&b).is_none(), "b was used before a");
-        assert!(cache.get(&a).is_some() && cache.get(&c).is_some(), "only one had to go");
+        assert!(cache.shelf().get(&b).is_none(), "b was used before a");
+        assert!(cache.shelf().get(&a).is_some() && cache.shelf().get(&c).is_some(), "only one had to go");
     }
 
     #[test]
@@ -167,6 +162,6 @@ mod tests {
         );
         cache.release(a);
         cache.insert(b, b_bytes, drop).unwrap();
-        assert!(cache.get(&a).is_none(), "the cap holds");
+        assert!(cache.shelf().get(&a).is_none(), "the cap holds");
     }
 }

@@ -1,5 +1,5 @@
-//! What the executors say, with each result's digest computed where the result was made: on the device's own thread, not on
-//! the owner task.
+//! The node's devices as the owner task sees them; and what executors say, with each result's digest computed where the
+//! result was made, not on the owner task.
 
 use std::collections::VecDeque;
 
@@ -8,7 +8,9 @@ use farm_core::{
     id::{ContentHash, DeviceIndex, JobAttempt},
     message::JobFailure,
 };
-use gpu_exec::{Executor, ExecutorEvent, Order};
+use gpu_exec::ExecutorEvent;
+
+use crate::executor::{Executor, Order};
 
 /// An executor's jobs: one running, one staged, one that interrupts or is interrupted.
 const EXECUTOR_DEPTH: usize = 3;
@@ -53,7 +55,8 @@ impl DeviceEvent {
 }
 
 impl Payload {
-    fn of(sections: Vec<Bytes>) -> Self {
+    /// Hashes a result.
+    pub(crate) fn of(sections: Vec<Bytes>) -> Self {
         let mut hasher = blake3::Hasher::new();
         for section in &sections {
             hasher.update(section);

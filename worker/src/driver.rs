@@ -2,7 +2,7 @@
 //! carries the machine's effects out. It never waits for a peer.
 
 use std::{
-    collections::{HashMap, HashSet},
+    collections::HashMap,
     sync::Arc,
     time::{Duration, Instant, SystemTime},
 };
@@ -11,11 +11,10 @@ use bytes::Bytes;
 use farm_core::{
     id::{ContentHash, DeviceIndex, JobAttempt, LinkId, NodeId},
     message::{AppToNode, CoordinatorToNode, JobFailure, LatencyClass, NodeToApp, NodeToCoordinator},
-    program::{Command, Content, JobProgram},
+    program::Content,
     time,
     worker::{Effect, Event, Provider, WorkerConfig, WorkerMachine},
 };
-use gpu_exec::{Executor, Order};
 use proto::{
     codec,
     control::{SessionError, SessionSender},
@@ -31,6 +30,7 @@ use crate::{
     End, WorkerOptions,
     content::ContentCache,
     device::{Device, DeviceEvent, DeviceNews},
+    executor::{Executor, Order},
     link::{self, Outbox},
     payload::Payloads,
     session::{self, NodeLink},
@@ -71,6 +71,7 @@ pub(crate) struct Setup {
     pub(crate) options: WorkerOptions,
     pub(crate) config: WorkerConfig,
     pub(crate) devices: Vec<Executor>,
+    pub(crate) contents: ContentCache,
     /// Unbounded for its senders, who must not wait; a device has at most six jobs, two events of each, and two an interruption.
     pub(crate) events: mpsc::UnboundedReceiver<DeviceEvent>,
     pub(crate) server: Arc<DataServer>,
@@ -106,12 +107,22 @@ struct Driver {
 
 /// Runs until drained, refused or dropped.
 pub(crate) async fn drive(setup: Setup) -> End {
-    let Setup { options, config, devices, mut events, server, session, inputs, mut received, registered } =
-        setup;
+    let Setup {
+        options,
+        config,
+        devices,
+        contents,
+        mut events,
+        server,
+        session,
+        inputs,
+        mut received,
+        registered,
+    } = setup;
     let mut driver = Driver {
         machine: WorkerMachine::new(config),
         origin: Instant::now(),
-        contents: ContentCache::new(options.content_cache_bytes),
+        contents,
         options,
         inputs: inputs.clone(),
         coordinator: None,
@@ -475,43 +486,16 @@ impl Driver {
     }
 
     fn execute(&mut self, job: JobAttempt, index: DeviceIndex, class: LatencyClass) {
-        let program = match self.payloads.program(job) {
-            Some(bytes) => codec::decode_program(&bytes).map_err(|error| error.to_string()),
-            None => Err("the node has no program of this job".to_owned()),
+        let order = self.payloads.program(job).map(|program| {
+            let limit = self.options.job_limit;
+            Order { job, class, program, limit }
+        });
+        let reason = match (order, self.devices.get_mut(usize::from(index.0))) {
+            (Some(order), Some(device)) => return device.execute(order),
+            (None, Some(_)) => "the node has no program of this job".to_owned(),
+            (_, None) => format!("{index} does not exist"),
         };
-        match (program, self.devices.get_mut(usize::from(index.0))) {
-            (Ok(program), Some(device)) => {
-                let contents = named_contents(&program)
-                    .into_iter()
-                    .filter_map(|hash| Some((hash, self.contents.get(&hash)?)))
-                    .collect();
-                let (program, limit) = (Arc::new(program), self.options.job_limit);
-                device.execute(Order { job, class, program, contents, limit });
-            }
-            (program, _) => {
-                let reason = program.err().unwrap_or_else(|| format!("{index} does not exist"));
-                let outcome = Err(JobFailure::InvalidProgram(reason));
-                self.found.push(Event::Executed { job, device: index, device_time_ns: 0, outcome });
-            }
-        }
+        let outcome = Err(JobFailure::InvalidProgram(reason));
+        self.found.push(Event::Executed { job, device: index, device_time_ns: 0, outcome });
     }
-}
-
-/// What a program names, each once.
-fn named_contents(program: &JobProgram) -> HashSet<ContentHash> {
-    program
-        .commands()
-        .iter()
-        .filter_map(|command| match command {
-            Command::TaskAllocation { content, .. } | Command::Function { module: content, .. } => {
-                Some(content.hash)
-            }
-            Command::Malloc { .. }
-            | Command::MemcpyHtoD { .. }
-            | Command::GlobalHtoD { .. }
-            | Command::Param { .. }
-            | Command::Launch { .. }
-            | Command::MemcpyDtoH { .. } => None,
-        })
-        .collect()
 }

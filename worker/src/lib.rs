@@ -6,6 +6,7 @@
 mod content;
 mod device;
 mod driver;
+mod executor;
 mod link;
 mod payload;
 mod session;
@@ -18,7 +19,7 @@ use farm_core::{
     message::Contact,
     worker::{Share, WorkerConfig},
 };
-use gpu_exec::{DeviceSpec, ExecutorConfig, OpenError};
+use gpu_exec::{DeviceSpec, OpenError};
 use proto::{
     control::SessionError,
     link::{BindError, DataServer},
@@ -30,7 +31,11 @@ use tokio::{
     task::JoinHandle,
 };
 
-use self::driver::{Input, QUEUED_INPUTS, Setup};
+pub use self::executor::{Isolation, serve_if_executor};
+use self::{
+    content::ContentCache,
+    driver::{Input, QUEUED_INPUTS, Setup},
+};
 
 /// Most jobs a worker holds, executed and unacknowledged ones too; further ones go back to the coordinator.
 const MAX_JOBS: usize = 65_536;
@@ -48,6 +53,8 @@ pub struct WorkerOptions {
     pub name: String,
     /// The devices to open.
     pub devices: Vec<DeviceSpec>,
+    /// Whether executors run in processes of their own.
+    pub isolation: Isolation,
     /// How long the coordinator is tried at the start.
     pub connect_timeout: Duration,
     /// Most bytes of task allocations and modules kept in memory.
@@ -76,6 +83,7 @@ impl WorkerOptions {
             advertise: Vec::new(),
             name: format!("worker-{}", std::process::id()),
             devices,
+            isolation: Isolation::None,
             connect_timeout: Duration::from_secs(10),
             content_cache_bytes: 4 << 30,
             spool_quota_bytes: 1 << 30,
@@ -94,6 +102,12 @@ pub enum StartError {
     /// A device cannot be opened.
     #[error(transparent)]
     Device(#[from] OpenError),
+    /// A device's executor process does not start, or does not open its device.
+    #[error("{reason}")]
+    Executor {
+        /// Its words.
+        reason: String,
+    },
     /// Not one device was asked for.
     #[error("no device: name one with --device (all, gpu:N, cpu, sim)")]
     NoDevice,
@@ -216,8 +230,10 @@ pub async fn start(options: WorkerOptions) -> Result<WorkerHandle, StartError> {
         check_cache(path).map_err(|source| StartError::Cache { path: path.clone(), source })?;
     }
     let (events_sender, events) = mpsc::unbounded_channel();
-    let devices = open_devices(options.devices.clone(), events_sender).await?;
-    let infos: Vec<DeviceInfo> = devices.iter().map(|executor| executor.info().clone()).collect();
+    let contents = ContentCache::new(options.content_cache_bytes);
+    let opened =
+        executor::open(options.devices.clone(), &options.isolation, contents.shelf(), &events_sender).await?;
+    let (devices, infos): (_, Vec<DeviceInfo>) = opened.into_iter().unzip();
     let server = Arc::new(DataServer::bind(options.listen, options.identity.as_ref())?);
     let data = server.local_addr();
     let advertise =
@@ -248,6 +264,7 @@ pub async fn start(options: WorkerOptions) -> Result<WorkerHandle, StartError> {
         options: options.clone(),
         config,
         devices,
+        contents,
         events,
         server,
         session,
@@ -276,21 +293,6 @@ pub async fn start(options: WorkerOptions) -> Result<WorkerHandle, StartError> {
     };
     let info = WorkerInfo { name: options.name, node, data, contact, devices: infos };
     Ok(WorkerHandle { info, inputs, driver })
-}
-
-/// Opens the executors on a thread that may block: a score is measured for up to a second a device.
-async fn open_devices(
-    specs: Vec<DeviceSpec>,
-    events: mpsc::UnboundedSender<device::DeviceEvent>,
-) -> Result<Vec<gpu_exec::Executor>, StartError> {
-    let opening = tokio::task::spawn_blocking(move || {
-        gpu_exec::open(&specs, ExecutorConfig::default(), move |index, event| {
-            // The driver is gone only when the worker ends: nobody is left to hear.
-            let _ = events.send(device::DeviceEvent::of(index, event));
-        })
-    });
-    let devices = opening.await.map_err(std::io::Error::other)??;
-    if devices.is_empty() { Err(StartError::NoDevice) } else { Ok(devices) }
 }
 
 fn check_cache(path: &std::path::Path) -> std::io::Result<()> {

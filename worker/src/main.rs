@@ -23,8 +23,6 @@ const EXIT_UNREACHABLE: u8 = 3;
 const EXIT_DENIED: u8 = 4;
 
 fn main() -> ExitCode {
-    // clap exits with 2 by itself.
-    let arguments = Arguments::parse();
     let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new("info,wgpu_hal=error"));
     // A log that cannot be written must not end the daemon.
     tracing_subscriber::fmt()
@@ -32,6 +30,11 @@ fn main() -> ExitCode {
         .with_writer(std::io::stderr)
         .log_internal_errors(false)
         .init();
+    if let Some(code) = worker::serve_if_executor(std::env::args_os()) {
+        return code;
+    }
+    // clap exits with 2 by itself.
+    let arguments = Arguments::parse();
     let options = match settings::options(arguments) {
         Ok(options) => options,
         Err(error) => return failed(EXIT_USAGE, &error),
@@ -55,6 +58,7 @@ fn exit_code(error: &anyhow::Error) -> u8 {
         Some(StartError::Denied { .. }) => EXIT_DENIED,
         Some(
             StartError::Device(_)
+            | StartError::Executor { .. }
             | StartError::Listen(_)
             | StartError::Cache { .. }
             | StartError::Refused { .. }

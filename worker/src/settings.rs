@@ -13,7 +13,7 @@ use farm_core::worker::Share;
 use gpu_exec::DeviceSpec;
 use proto::trust::{Identity, Role, default_identity};
 use serde::Deserialize;
-use worker::WorkerOptions;
+use worker::{Isolation, WorkerOptions};
 
 /// Largest config file that is read, in bytes.
 const MAX_CONFIG_BYTES: u64 = 1 << 20;
@@ -175,6 +175,7 @@ pub(crate) fn options(arguments: Arguments) -> anyhow::Result<WorkerOptions> {
             Rule::Stride => Share::Stride,
         },
         cache: arguments.cache.or(file.cache),
+        isolation: Isolation::own_binary(),
         ..defaults
     })
 }

@@ -145,23 +145,23 @@ impl AllocationCache {
         Self { entries: HashMap::new(), bytes: 0, cap_bytes, clock: 0 }
     }
 
-    /// The allocation's buffer, uploaded if it is not here. The caller's clone pins it.
+    /// The allocation's buffer; if it is not here, `bytes` are asked for and uploaded. The caller's clone pins it.
     ///
     /// A buffer is a multiple of 4 long; the last bytes are zeros.
     pub(crate) fn get(
         &mut self,
         gpu: &Gpu,
         hash: ContentHash,
-        bytes: Option<&Bytes>,
+        bytes: impl FnOnce() -> Option<Bytes>,
     ) -> Option<Result<Arc<wgpu::Buffer>, Refusal>> {
         self.clock += 1;
         if let Some(entry) = self.entries.get_mut(&hash) {
             entry.used_at = self.clock;
             return Some(Ok(Arc::clone(&entry.buffer)));
         }
-        let bytes = bytes?;
+        let bytes = bytes()?;
         self.evict_to(self.cap_bytes.saturating_sub(bytes.len() as u64));
-        let uploaded = gpu.scoped(|| upload(gpu, bytes)).map(Arc::new);
+        let uploaded = gpu.scoped(|| upload(gpu, &bytes)).map(Arc::new);
         if let Ok(buffer) = &uploaded {
             self.bytes += buffer.size();
             self.entries.insert(hash, Entry { buffer: Arc::clone(buffer), used_at: self.clock });

@@ -36,7 +36,7 @@ use self::{
 };
 use crate::{
     error::{Busy, OpenError},
-    executor::{DEPTH, EventSink, ExecutorConfig, Order},
+    executor::{DEPTH, ExecutorConfig, Host, Order},
     spec::DeviceSpec,
 };
 
@@ -68,7 +68,7 @@ impl RealDevice {
     pub(crate) fn start(
         spec: DeviceSpec,
         config: ExecutorConfig,
-        on_event: EventSink,
+        host: Box<dyn Host>,
     ) -> Result<(Self, DeviceInfo), OpenError> {
         let gpu = Gpu::open(spec)?;
         let score = score::measure(&gpu).map_err(|reason| OpenError::Device {
@@ -88,7 +88,7 @@ impl RealDevice {
         // Bounded by DEPTH orders and the aborts of these.
         let (sender, inbox) = mpsc::channel();
         let (ending, ended) = mpsc::channel();
-        let thread = DeviceThread::new(spec, gpu, config, inbox, Arc::clone(&shared), on_event);
+        let thread = DeviceThread::new(spec, gpu, config, inbox, Arc::clone(&shared), host);
         std_thread::Builder::new()
             .name(format!("device {spec}"))
             .stack_size(STACK_BYTES)

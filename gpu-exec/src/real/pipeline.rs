@@ -5,6 +5,7 @@ use std::{
     sync::Arc,
 };
 
+use bytes::Bytes;
 use farm_core::{id::ContentHash, message::JobFailure};
 
 use super::{
@@ -71,13 +72,13 @@ impl PipelineCache {
     }
 
     /// The pipeline of an entry point; compiled if it is not here. `source` gives the module's bytes.
-    pub(crate) fn get<'a>(
+    pub(crate) fn get(
         &mut self,
         gpu: &Gpu,
         module: ContentHash,
         entry: &str,
         constants: &[(String, f64)],
-        source: impl FnOnce() -> Option<&'a [u8]>,
+        source: impl FnOnce() -> Option<Bytes>,
     ) -> Result<Arc<Pipeline>, JobFailure> {
         self.clock += 1;
         let at = self.clock;
@@ -94,11 +95,11 @@ impl PipelineCache {
         Ok(pipeline)
     }
 
-    fn module<'a>(
+    fn module(
         &mut self,
         gpu: &Gpu,
         hash: ContentHash,
-        source: impl FnOnce() -> Option<&'a [u8]>,
+        source: impl FnOnce() -> Option<Bytes>,
     ) -> Result<Arc<Module>, JobFailure> {
         let at = self.clock;
         if let Some(used) = self.modules.get_mut(&hash) {
@@ -106,7 +107,7 @@ impl PipelineCache {
             return Ok(Arc::clone(&used.value));
         }
         let bytes = source().ok_or(JobFailure::ContentUnavailable(hash))?;
-        let module = Module::compile(gpu, bytes, self.unchecked)
+        let module = Module::compile(gpu, &bytes, self.unchecked)
             .map_err(|refusal| refusal.into_failure(&format!("module {hash:?}")))?;
         let module = Arc::new(module);
         make_room(&mut self.modules, self.max_modules);

@@ -17,7 +17,7 @@ use super::{
     memory::{AllocationCache, Pool, Pooled, Purpose, SliceTable},
     pipeline::{Pipeline, PipelineCache},
 };
-use crate::executor::{ExecutorConfig, Order};
+use crate::executor::{ExecutorConfig, Host, Order};
 
 /// What a device holds over the jobs.
 #[derive(Debug)]
@@ -149,7 +149,12 @@ fn bind<'a>(
 }
 
 /// Prepares an order. When the device has no memory, idle buffers are freed and it is tried once more.
-pub(crate) fn prepare(gpu: &Gpu, caches: &mut Caches, order: &Order) -> Result<Prepared, JobFailure> {
+pub(crate) fn prepare(
+    gpu: &Gpu,
+    caches: &mut Caches,
+    order: &Order,
+    host: &dyn Host,
+) -> Result<Prepared, JobFailure> {
     let quota = ProgramQuota {
         memory_bytes: gpu.memory_bytes(),
         result_bytes: ProgramQuota::default().result_bytes.min(gpu.limits.max_buffer_size & !3),
@@ -159,12 +164,12 @@ pub(crate) fn prepare(gpu: &Gpu, caches: &mut Caches, order: &Order) -> Result<P
     let summary =
         validate(&order.program, &quota).map_err(|error| JobFailure::InvalidProgram(error.to_string()))?;
     check_limits(gpu, &summary)?;
-    match attempt(gpu, caches, order, &summary) {
+    match attempt(gpu, caches, order, host, &summary) {
         Err(JobFailure::OutOfMemory(reason)) => {
             tracing::info!(job = %order.job, reason, "freeing idle device memory");
             caches.pool.trim();
             caches.allocations.trim();
-            attempt(gpu, caches, order, &summary)
+            attempt(gpu, caches, order, host, &summary)
         }
         outcome => outcome,
     }
@@ -191,9 +196,10 @@ fn attempt(
     gpu: &Gpu,
     caches: &mut Caches,
     order: &Order,
+    host: &dyn Host,
     summary: &ProgramSummary,
 ) -> Result<Prepared, JobFailure> {
-    let mut preparation = Preparation::new(gpu, caches, order);
+    let mut preparation = Preparation::new(gpu, caches, order, host);
     let built = gpu.scoped(|| {
         preparation.allocate()?;
         preparation.replay(&summary.sections)
@@ -225,6 +231,7 @@ struct Preparation<'a> {
     gpu: &'a Gpu,
     caches: &'a mut Caches,
     order: &'a Order,
+    host: &'a dyn Host,
     held: Held,
     steps: Vec<Step>,
     buffers: BTreeMap<Buffer, wgpu::Buffer>,
@@ -241,12 +248,19 @@ struct KernelState {
     bound: Option<Vec<Option<wgpu::BindGroup>>>,
 }
 
+/// A content's bytes, from the order or from the host.
+fn content_bytes(order: &Order, host: &dyn Host, hash: ContentHash) -> Option<Bytes> {
+    let brought = order.contents.iter().find(|(named, _)| *named == hash);
+    brought.map(|(_, bytes)| bytes.clone()).or_else(|| host.content(&hash))
+}
+
 impl<'a> Preparation<'a> {
-    fn new(gpu: &'a Gpu, caches: &'a mut Caches, order: &'a Order) -> Self {
+    fn new(gpu: &'a Gpu, caches: &'a mut Caches, order: &'a Order, host: &'a dyn Host) -> Self {
         Self {
             gpu,
             caches,
             order,
+            host,
             held: Held::default(),
             steps: Vec::with_capacity(order.program.commands().len()),
             buffers: BTreeMap::new(),
@@ -255,13 +269,9 @@ impl<'a> Preparation<'a> {
         }
     }
 
-    fn content(&self, hash: ContentHash) -> Option<&'a Bytes> {
-        self.order.contents.iter().find(|(named, _)| *named == hash).map(|(_, bytes)| bytes)
-    }
-
     /// First pass: buffers, zero-filled; pipelines; one staging buffer for all that is copied or bound later.
     fn allocate(&mut self) -> Result<(), JobFailure> {
-        let order = self.order;
+        let (order, host) = (self.order, self.host);
         let (mut staging_bytes, mut device_touched) = (0_u64, false);
         let alignment = self.gpu.global_alignment();
         let mut fills = self.gpu.device.create_command_encoder(&wgpu::CommandEncoderDescriptor::default());
@@ -276,22 +286,22 @@ impl<'a> Preparation<'a> {
                     self.held.buffers.push(pooled);
                 }
                 Command::TaskAllocation { buffer, content } => {
-                    let bytes = self.content(content.hash);
                     let cached = self
                         .caches
                         .allocations
-                        .get(self.gpu, content.hash, bytes)
+                        .get(self.gpu, content.hash, || content_bytes(order, host, content.hash))
                         .ok_or(JobFailure::ContentUnavailable(content.hash))?
                         .map_err(|refusal| refusal.into_failure(&format!("command {index}")))?;
                     self.buffers.insert(*buffer, wgpu::Buffer::clone(&cached));
                     self.held.allocations.push(cached);
                 }
                 Command::Function { kernel, module, entry, constants } => {
-                    let source = self.content(module.hash);
                     let pipeline = self
                         .caches
                         .pipelines
-                        .get(self.gpu, module.hash, entry, constants, || source.map(Bytes::as_ref))
+                        .get(self.gpu, module.hash, entry, constants, || {
+                            content_bytes(order, host, module.hash)
+                        })
                         .map_err(|failure| at_command(index, failure))?;
                     self.kernels.insert(*kernel, KernelState::new(pipeline));
                 }

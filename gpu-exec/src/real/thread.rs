@@ -30,7 +30,7 @@ use super::{
     run::{Hung, Run},
 };
 use crate::{
-    executor::{EventSink, ExecutorConfig, ExecutorEvent, Order},
+    executor::{ExecutorConfig, ExecutorEvent, Host, HungDevice, Order},
     spec::DeviceSpec,
 };
 
@@ -54,7 +54,7 @@ pub(super) struct DeviceThread {
     config: ExecutorConfig,
     inbox: Receiver<Message>,
     shared: Arc<Shared>,
-    on_event: EventSink,
+    host: Box<dyn Host>,
     state: State,
     /// Hung devices whose work has not ended yet.
     abandoned: Arc<AtomicUsize>,
@@ -127,10 +127,10 @@ impl DeviceThread {
         config: ExecutorConfig,
         inbox: Receiver<Message>,
         shared: Arc<Shared>,
-        on_event: EventSink,
+        host: Box<dyn Host>,
     ) -> Self {
         let state = State::new(gpu, &config);
-        Self { spec, config, inbox, shared, on_event, state, abandoned: Arc::default() }
+        Self { spec, config, inbox, shared, host, state, abandoned: Arc::default() }
     }
 
     /// Works until the handle is dropped.
@@ -230,9 +230,11 @@ impl DeviceThread {
         {
             let order = self.state.waiting.remove(position);
             let job = order.job;
+            self.host.preparing(job);
             // A panic in here is the order's: it must not come back.
+            let State { gpu, caches, .. } = &mut self.state;
             let prepared =
-                catch_unwind(AssertUnwindSafe(|| prepare(&self.state.gpu, &mut self.state.caches, &order)))
+                catch_unwind(AssertUnwindSafe(|| prepare(gpu, caches, &order, self.host.as_ref())))
                     .unwrap_or_else(|panic| Err(JobFailure::InvalidProgram(panic_text(panic.as_ref()))));
             match prepared {
                 Ok(prepared) => self.state.staged.push((order, prepared)),
@@ -251,7 +253,7 @@ impl DeviceThread {
                 self.state.running = Some(running);
                 return;
             }
-            (self.on_event)(ExecutorEvent::Yielded { job: running.job });
+            self.host.event(ExecutorEvent::Yielded { job: running.job });
             self.state.yielded = Some(running.paused(Instant::now()));
         }
         let next = self.next_run();
@@ -261,7 +263,7 @@ impl DeviceThread {
             self.finished(job, device_time_ns, outcome);
         }
         if let Some((next, event)) = next {
-            (self.on_event)(event);
+            self.host.event(event);
             self.state.running = Some(next);
         }
     }
@@ -292,13 +294,16 @@ impl DeviceThread {
     fn finished(&self, job: JobAttempt, device_time_ns: u64, outcome: Result<Vec<Bytes>, JobFailure>) {
         // First, so that the callback may submit the next one.
         self.shared.held.fetch_sub(1, Ordering::AcqRel);
-        (self.on_event)(ExecutorEvent::Finished { job, device_time_ns, outcome });
+        self.host.event(ExecutorEvent::Finished { job, device_time_ns, outcome });
     }
 
     /// Ends the running attempt and the interrupted one, whose state is lost too, leaves the device behind and opens a new one.
     fn replace_device(&mut self, reason: &Hung) -> Result<(), String> {
         tracing::warn!(spec = %self.spec, reason = reason.0, "replacing the device");
         self.fail_running(reason);
+        if self.config.hung_device == HungDevice::Lost {
+            return Err(reason.0.clone());
+        }
         let opened = Gpu::reopen(self.spec);
         let gpu = opened.map_err(|error| format!("{}; it does not open again: {error}", reason.0))?;
         let mut old = mem::replace(&mut self.state, State::new(gpu, &self.config));
@@ -339,10 +344,12 @@ impl DeviceThread {
         self.shared.lost.store(true, Ordering::Release);
         let failure = || Err(JobFailure::DeviceLost(reason.clone()));
         let staged = mem::take(&mut self.state.staged).into_iter().map(|(order, _)| order);
-        for order in staged.chain(mem::take(&mut self.state.waiting)) {
-            self.finished(order.job, 0, failure());
+        let left: Vec<Order> = staged.chain(mem::take(&mut self.state.waiting)).collect();
+        match self.config.hung_device {
+            HungDevice::Reopened => left.iter().for_each(|order| self.finished(order.job, 0, failure())),
+            HungDevice::Lost => {}
         }
-        (self.on_event)(ExecutorEvent::Lost { reason: reason.clone() });
+        self.host.event(ExecutorEvent::Lost { reason: reason.clone() });
         // An order may have been sent while the flag was being set.
         while let Ok(message) = self.inbox.recv() {
             match message {

@@ -1,0 +1,362 @@
+//! What an executor process holds, how far each job is, and whose fault it is when the process dies. No process and no
+//! clock in here: the same events at the same times give the same answers.
+
+use std::{
+    collections::VecDeque,
+    time::{Duration, Instant},
+};
+
+use farm_core::{id::JobAttempt, message::JobFailure};
+
+use super::Order;
+
+/// How long a job may take beyond its limit. The executor itself ends the job at its limit and gives a submit that is
+/// on the way two seconds; this is for one that cannot do even that.
+const GRACE: Duration = Duration::from_millis(2_500);
+/// How long compiling and uploading may take. A path tracer's kernels take some ten seconds on the slowest driver known.
+const PREPARATION_LIMIT: Duration = Duration::from_secs(120);
+
+/// The jobs of one executor process.
+#[derive(Debug)]
+pub(super) struct Book {
+    /// In order of arrival; at most what an executor takes.
+    held: VecDeque<Held>,
+    /// A job that may have taken the last process down while it was prepared: it is tried with nothing beside it.
+    suspect: Option<JobAttempt>,
+    /// When the process said something last.
+    heard: Instant,
+}
+
+#[derive(Debug)]
+struct Held {
+    order: Order,
+    stage: Stage,
+}
+
+#[derive(Clone, Copy, Debug)]
+enum Stage {
+    /// Not with the process yet.
+    Waiting,
+    /// With the process.
+    Sent,
+    /// Being compiled and uploaded.
+    Preparing { since: Instant },
+    /// On the device; `ran` before.
+    Running { since: Instant, ran: Duration },
+    /// Made way for another one.
+    Interrupted { ran: Duration },
+}
+
+/// A job that ends with its process.
+#[derive(Debug, PartialEq, Eq)]
+pub(super) struct Victim {
+    pub(super) job: JobAttempt,
+    pub(super) device_time_ns: u64,
+    pub(super) failure: JobFailure,
+}
+
+/// Where a job that is to be taken back is.
+#[derive(Debug, PartialEq, Eq)]
+pub(super) enum Aborted {
+    /// With the process: tell it.
+    There,
+    /// It had not got there, and is gone.
+    Here,
+    /// It has ended.
+    Over,
+}
+
+impl Book {
+    pub(super) fn new(now: Instant) -> Self {
+        Self { held: VecDeque::new(), suspect: None, heard: now }
+    }
+
+    /// A new order.
+    pub(super) fn take(&mut self, order: Order) {
+        self.held.push_back(Held { order, stage: Stage::Waiting });
+    }
+
+    /// The next order for the process; it counts as sent.
+    pub(super) fn next(&mut self) -> Option<&Order> {
+        let suspect = self.suspect;
+        let next = self.held.iter_mut().find(|held| {
+            matches!(held.stage, Stage::Waiting) && suspect.is_none_or(|suspect| held.order.job == suspect)
+        })?;
+        next.stage = Stage::Sent;
+        Some(&next.order)
+    }
+
+    pub(super) fn abort(&mut self, job: JobAttempt) -> Aborted {
+        match self.find(job).map(|held| held.stage) {
+            None => Aborted::Over,
+            Some(Stage::Waiting) => {
+                self.remove(job);
+                Aborted::Here
+            }
+            Some(
+                Stage::Sent | Stage::Preparing { .. } | Stage::Running { .. } | Stage::Interrupted { .. },
+            ) => Aborted::There,
+        }
+    }
+
+    pub(super) fn preparing(&mut self, now: Instant, job: JobAttempt) {
+        self.heard = now;
+        // One at a time: what was prepared before is staged.
+        for held in &mut self.held {
+            if matches!(held.stage, Stage::Preparing { .. }) {
+                held.stage = Stage::Sent;
+            }
+        }
+        self.set(job, Stage::Preparing { since: now });
+    }
+
+    /// It runs, for the first time or again.
+    pub(super) fn runs(&mut self, now: Instant, job: JobAttempt) {
+        self.heard = now;
+        self.cleared(job);
+        let ran = self.find(job).map_or(Duration::ZERO, |held| held.ran(now));
+        self.set(job, Stage::Running { since: now, ran });
+    }
+
+    pub(super) fn yielded(&mut self, now: Instant, job: JobAttempt) {
+        self.heard = now;
+        let ran = self.find(job).map_or(Duration::ZERO, |held| held.ran(now));
+        self.set(job, Stage::Interrupted { ran });
+    }
+
+    /// It is over; false if it was not here.
+    pub(super) fn finished(&mut self, now: Instant, job: JobAttempt) -> bool {
+        self.heard = now;
+        self.remove(job)
+    }
+
+    /// When the process counts as hung, if nothing is heard before.
+    pub(super) fn deadline(&self) -> Option<Instant> {
+        self.held.iter().filter_map(|held| self.deadline_of(held)).min()
+    }
+
+    /// The process is gone, whether by itself or because it was hung: who ends with it. All others start over.
+    pub(super) fn lost(&mut self, now: Instant, reason: &str) -> Vec<Victim> {
+        let overdue: Vec<JobAttempt> = self.those(|held| self.deadline_of(held).is_some_and(|at| at <= now));
+        let on_device = |held: &Held| matches!(held.stage, Stage::Running { .. } | Stage::Interrupted { .. });
+        let mut victims = self.those(on_device);
+        self.suspect = None;
+        // At most one is prepared. With nothing on the device it was this one; else it is one of two.
+        for job in self.those(|held| matches!(held.stage, Stage::Preparing { .. })) {
+            if victims.is_empty() || overdue.contains(&job) {
+                victims.push(job);
+            } else {
+                self.suspect = Some(job);
+            }
+        }
+        let victims: Vec<Victim> = victims
+            .into_iter()
+            .filter_map(|job| {
+                let held = self.find(job)?;
+                let failure = if overdue.contains(&job) {
+                    JobFailure::Timeout
+                } else {
+                    JobFailure::DeviceLost(reason.to_owned())
+                };
+                let device_time_ns = u64::try_from(held.ran(now).as_nanos()).unwrap_or(u64::MAX);
+                Some(Victim { job, device_time_ns, failure })
+            })
+            .collect();
+        for Victim { job, .. } in &victims {
+            self.remove(*job);
+        }
+        for held in &mut self.held {
+            held.stage = Stage::Waiting;
+        }
+        self.heard = now;
+        victims
+    }
+
+    /// Everything that is held, which is over: there will be no further process.
+    pub(super) fn clear(&mut self) -> Vec<JobAttempt> {
+        self.suspect = None;
+        self.held.drain(..).map(|held| held.order.job).collect()
+    }
+
+    fn deadline_of(&self, held: &Held) -> Option<Instant> {
+        match held.stage {
+            Stage::Running { since, ran } => Some(since + held.order.limit.saturating_sub(ran) + GRACE),
+            Stage::Preparing { since } => Some(since + PREPARATION_LIMIT),
+            // Behind another one it may wait as long as that takes.
+            Stage::Sent if !self.is_busy() => Some(self.heard + PREPARATION_LIMIT),
+            Stage::Sent | Stage::Waiting | Stage::Interrupted { .. } => None,
+        }
+    }
+
+    fn is_busy(&self) -> bool {
+        self.held.iter().any(|held| matches!(held.stage, Stage::Running { .. } | Stage::Preparing { .. }))
+    }
+
+    /// The job has come further than where a suspect falls.
+    fn cleared(&mut self, job: JobAttempt) {
+        self.suspect.take_if(|suspect| *suspect == job);
+    }
+
+    fn those(&self, wanted: impl Fn(&Held) -> bool) -> Vec<JobAttempt> {
+        self.held.iter().filter(|held| wanted(held)).map(|held| held.order.job).collect()
+    }
+
+    fn find(&self, job: JobAttempt) -> Option<&Held> {
+        self.held.iter().find(|held| held.order.job == job)
+    }
+
+    fn set(&mut self, job: JobAttempt, stage: Stage) {
+        if let Some(held) = self.held.iter_mut().find(|held| held.order.job == job) {
+            held.stage = stage;
+        }
+    }
+
+    fn remove(&mut self, job: JobAttempt) -> bool {
+        self.cleared(job);
+        let before = self.held.len();
+        self.held.retain(|held| held.order.job != job);
+        self.held.len() < before
+    }
+}
+
+impl Held {
+    /// How long it has been on the device.
+    fn ran(&self, now: Instant) -> Duration {
+        match self.stage {
+            Stage::Waiting | Stage::Sent | Stage::Preparing { .. } => Duration::ZERO,
+            Stage::Running { since, ran } => ran + now.saturating_duration_since(since),
+            Stage::Interrupted { ran } => ran,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use bytes::Bytes;
+    use farm_core::{
+        id::{AppId, Attempt, Epoch, JobId, JobIndex, TaskId},
+        message::LatencyClass,
+    };
+
+    use super::*;
+
+    const LIMIT: Duration = Duration::from_secs(10);
+
+    fn job(index: u32) -> JobAttempt {
+        let job = JobId { app: AppId(1), task: TaskId(1), index: JobIndex(index) };
+        JobAttempt { job, attempt: Attempt { epoch: Epoch(1), sequence: 1 } }
+    }
+
+    /// A book in which jobs 0, 1, ... were taken and sent.
+    fn sent(now: Instant, jobs: u32) -> Book {
+        let mut book = Book::new(now);
+        for index in 0..jobs {
+            let (class, program) = (LatencyClass::Batch, Bytes::new());
+            book.take(Order { job: job(index), class, program, limit: LIMIT });
+        }
+        for index in 0..jobs {
+            assert_eq!(next(&mut book), Some(job(index)), "in the order of arrival");
+        }
+        assert_eq!(next(&mut book), None, "each once");
+        book
+    }
+
+    fn next(book: &mut Book) -> Option<JobAttempt> {
+        book.next().map(|order| order.job)
+    }
+
+    fn crashed(job: JobAttempt, device_time_ns: u64) -> Victim {
+        Victim { job, device_time_ns, failure: JobFailure::DeviceLost("crash".to_owned()) }
+    }
+
+    #[test]
+    fn a_crash_costs_what_was_on_the_device_and_the_rest_starts_over() {
+        let start = Instant::now();
+        let mut book = sent(start, 3);
+        book.preparing(start, job(0));
+        book.runs(start, job(0));
+        book.yielded(start + Duration::from_secs(1), job(0));
+        book.runs(start + Duration::from_secs(1), job(1));
+        let victims = book.lost(start + Duration::from_secs(3), "crash");
+        assert_eq!(victims, [crashed(job(0), 1_000_000_000), crashed(job(1), 2_000_000_000)]);
+        assert_eq!(next(&mut book), Some(job(2)));
+        assert_eq!(next(&mut book), None);
+    }
+
+    #[test]
+    fn who_crashes_it_with_nothing_on_the_device_was_being_prepared() {
+        let start = Instant::now();
+        let mut book = sent(start, 2);
+        book.preparing(start, job(0));
+        assert_eq!(book.lost(start, "crash"), [crashed(job(0), 0)]);
+        assert_eq!(next(&mut book), Some(job(1)));
+    }
+
+    #[test]
+    fn one_that_was_prepared_beside_a_running_one_is_tried_alone() {
+        let start = Instant::now();
+        let mut book = sent(start, 3);
+        book.runs(start, job(0));
+        book.preparing(start, job(2));
+        assert_eq!(book.lost(start, "crash"), [crashed(job(0), 0)]);
+        assert_eq!(next(&mut book), Some(job(2)), "alone");
+        assert_eq!(next(&mut book), None, "nothing goes with it");
+        book.preparing(start, job(2));
+        let mut innocent = book.lost(start, "crash");
+        assert_eq!(innocent.pop(), Some(crashed(job(2), 0)), "it was this one");
+        assert_eq!((innocent.len(), next(&mut book)), (0, Some(job(1))));
+    }
+
+    #[test]
+    fn a_suspect_is_cleared_when_it_starts_ends_or_is_taken_back() {
+        let clear: [fn(&mut Book, Instant); 3] = [
+            |book, now| {
+                next(book);
+                book.runs(now, job(1));
+            },
+            |book, now| {
+                next(book);
+                assert!(book.finished(now, job(1)), "it was here");
+            },
+            |book, _| assert_eq!(book.abort(job(1)), Aborted::Here, "it had not been sent again"),
+        ];
+        for clear in clear {
+            let start = Instant::now();
+            let mut book = sent(start, 3);
+            book.runs(start, job(0));
+            book.preparing(start, job(1));
+            book.lost(start, "crash");
+            clear(&mut book, start);
+            assert_eq!(next(&mut book), Some(job(2)), "the others go on");
+        }
+    }
+
+    #[test]
+    fn a_job_beyond_its_limit_times_out_and_interruptions_do_not_count() {
+        let start = Instant::now();
+        let at = |seconds| start + Duration::from_secs(seconds);
+        let mut book = sent(start, 2);
+        book.runs(start, job(0));
+        assert_eq!(book.deadline(), Some(at(10) + GRACE));
+        book.yielded(at(4), job(0));
+        book.runs(at(4), job(1));
+        assert!(book.finished(at(100), job(1)), "it was here");
+        book.runs(at(100), job(0));
+        assert_eq!(book.deadline(), Some(at(106) + GRACE), "four of its ten seconds are used");
+        let victims = book.lost(at(106) + GRACE, "hung");
+        assert_eq!(victims[0].failure, JobFailure::Timeout);
+    }
+
+    #[test]
+    fn a_job_that_is_never_taken_up_times_out_too() {
+        let start = Instant::now();
+        let mut book = sent(start, 2);
+        let deadline = book.deadline().expect("nothing is heard of the first");
+        assert_eq!(deadline, start + PREPARATION_LIMIT);
+        book.preparing(start, job(0));
+        let later = start + PREPARATION_LIMIT;
+        assert_eq!(book.deadline(), Some(later));
+        let victims = book.lost(later, "hung");
+        assert_eq!(victims, [Victim { job: job(0), device_time_ns: 0, failure: JobFailure::Timeout }]);
+    }
+}

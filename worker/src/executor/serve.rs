@@ -1,0 +1,194 @@
+//! The executor process itself: one device, orders in from the socket that is its standard input, news out on it.
+
+use std::{
+    collections::HashMap,
+    io::{self, Read as _, Write as _},
+    os::{fd::AsFd as _, unix::net::UnixStream},
+    process::ExitCode,
+    sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError},
+    thread,
+    time::Duration,
+};
+
+use bytes::Bytes;
+use farm_core::{
+    id::{ContentHash, JobAttempt},
+    message::JobFailure,
+};
+use gpu_exec::{DeviceSpec, Executor, ExecutorConfig, ExecutorEvent, Host, HungDevice, Order};
+use proto::codec;
+
+use super::wire::{self, FromExecutor, Header as _, LENGTH_BYTES, Output, ToExecutor};
+use crate::device::Payload;
+
+/// How long a content may take from the worker's memory to here; longer means that the worker has stopped.
+const CONTENT_WAIT: Duration = Duration::from_secs(60);
+/// How long the end of the process may take, drivers' clean-up included.
+const ENDING_LIMIT: Duration = Duration::from_secs(3);
+/// Exit code where there is no worker at the other end.
+const EXIT_USAGE: u8 = 2;
+
+/// Opens the device `spec` and runs jobs on it until the worker at the other end of standard input is gone.
+pub(super) fn serve(spec: &str) -> ExitCode {
+    let Ok(socket) = io::stdin().as_fd().try_clone_to_owned().map(UnixStream::from) else {
+        return ExitCode::from(EXIT_USAGE);
+    };
+    let line =
+        Arc::new(Line { socket, writing: Mutex::default(), arrived: Mutex::default(), news: Condvar::new() });
+    match run(spec, &line) {
+        Ok(()) => {
+            end_soon();
+            ExitCode::SUCCESS
+        }
+        Err(error) => {
+            // Whoever started this by hand reads it.
+            let _ = writeln!(io::stderr(), "an executor is started by a worker: {error}");
+            ExitCode::from(EXIT_USAGE)
+        }
+    }
+}
+
+fn run(spec: &str, line: &Arc<Line>) -> io::Result<()> {
+    let config = ExecutorConfig { hung_device: HungDevice::Lost, ..ExecutorConfig::default() };
+    let opened = spec.parse::<DeviceSpec>().map_err(|error| error.to_string()).and_then(|spec| {
+        let host = Speaker(Arc::clone(line));
+        Executor::start(&spec, config, host).map_err(|error| error.to_string())
+    });
+    let executor = match opened {
+        Ok(executor) => executor,
+        Err(reason) => return line.say(&FromExecutor::Refused(reason), &[]),
+    };
+    line.say(&FromExecutor::Opened(executor.info().clone()), &[])?;
+    loop {
+        match line.hear() {
+            Ok((header, payload)) => take(&executor, line, header, payload)?,
+            // The worker is gone, and with it whoever wants a result.
+            Err(_) => return Ok(()),
+        }
+    }
+}
+
+fn take(executor: &Executor, line: &Line, header: ToExecutor, payload: Bytes) -> io::Result<()> {
+    match header {
+        ToExecutor::Execute { job, class, limit, .. } => {
+            let failure = match codec::decode_program(&payload) {
+                Ok(program) => {
+                    let order = Order { job, class, program: Arc::new(program), contents: Vec::new(), limit };
+                    let busy = executor.submit(order).err();
+                    busy.map(|busy| JobFailure::DeviceLost(busy.to_string()))
+                }
+                Err(error) => Some(JobFailure::InvalidProgram(error.to_string())),
+            };
+            match failure {
+                Some(failure) => line.finished(job, 0, Err(failure)),
+                None => Ok(()),
+            }
+        }
+        ToExecutor::Abort(job) => {
+            executor.abort(job);
+            Ok(())
+        }
+        ToExecutor::Content { hash, size_bytes } => {
+            line.arrived().insert(hash, size_bytes.map(|_| payload));
+            line.news.notify_all();
+            Ok(())
+        }
+    }
+}
+
+/// A driver that does not come to its end does not keep the process.
+fn end_soon() {
+    // Without a thread the end may take as long as the driver likes.
+    let _ = thread::Builder::new().spawn(|| {
+        thread::sleep(ENDING_LIMIT);
+        std::process::abort();
+    });
+}
+
+/// The socket to the worker.
+struct Line {
+    socket: UnixStream,
+    /// One message at a time: the device's thread writes, and the one that reads.
+    writing: Mutex<()>,
+    /// Contents that came and were not taken yet. A lock and a signal: the device's thread waits in the middle of a job's
+    /// preparation.
+    arrived: Mutex<HashMap<ContentHash, Option<Bytes>>>,
+    news: Condvar,
+}
+
+/// What the device tells, and asks of, the worker.
+struct Speaker(Arc<Line>);
+
+impl Host for Speaker {
+    fn event(&self, event: ExecutorEvent) {
+        let told = match event {
+            ExecutorEvent::Started { job } => self.0.say(&FromExecutor::Started(job), &[]),
+            ExecutorEvent::Yielded { job } => self.0.say(&FromExecutor::Yielded(job), &[]),
+            ExecutorEvent::Resumed { job } => self.0.say(&FromExecutor::Resumed(job), &[]),
+            ExecutorEvent::Finished { job, device_time_ns, outcome } => {
+                self.0.finished(job, device_time_ns, outcome)
+            }
+            ExecutorEvent::Lost { reason } => self.0.say(&FromExecutor::Lost(reason), &[]),
+        };
+        // A worker that is gone is noticed by the thread that reads.
+        let _ = told;
+    }
+
+    fn preparing(&self, job: JobAttempt) {
+        let _ = self.0.say(&FromExecutor::Preparing(job), &[]);
+    }
+
+    fn content(&self, hash: &ContentHash) -> Option<Bytes> {
+        self.0.say(&FromExecutor::Wants(*hash), &[]).ok()?;
+        let missing = |arrived: &mut HashMap<_, _>| !arrived.contains_key(hash);
+        let waited = self.0.news.wait_timeout_while(self.0.arrived(), CONTENT_WAIT, missing);
+        let (mut arrived, _) = waited.unwrap_or_else(PoisonError::into_inner);
+        arrived.remove(hash).flatten()
+    }
+}
+
+impl Line {
+    fn finished(
+        &self,
+        job: JobAttempt,
+        device_time_ns: u64,
+        outcome: Result<Vec<Bytes>, JobFailure>,
+    ) -> io::Result<()> {
+        let (outcome, sections) = match outcome.map(Payload::of) {
+            Ok(Payload { sections, digest }) => {
+                let lengths = sections.iter().map(|section| section.len() as u64).collect();
+                (Ok(Output { sections: lengths, digest }), sections)
+            }
+            Err(failure) => (Err(failure), Vec::new()),
+        };
+        self.say(&FromExecutor::Finished { job, device_time_ns, outcome }, &sections)
+    }
+
+    fn say(&self, header: &FromExecutor, payload: &[Bytes]) -> io::Result<()> {
+        let header = wire::encode(header);
+        let _one = self.writing.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut socket = &self.socket;
+        socket.write_all(&header)?;
+        payload.iter().try_for_each(|part| socket.write_all(part))
+    }
+
+    fn hear(&self) -> io::Result<(ToExecutor, Bytes)> {
+        let mut socket = &self.socket;
+        let mut length = [0; LENGTH_BYTES];
+        socket.read_exact(&mut length)?;
+        let mut header = vec![0; wire::header_bytes(length).map_err(io::Error::other)?];
+        socket.read_exact(&mut header)?;
+        let header: ToExecutor = wire::decode(&header).map_err(io::Error::other)?;
+        let payload_bytes = header.payload_bytes().map_err(io::Error::other)?;
+        let mut payload = Vec::with_capacity(payload_bytes);
+        socket.take(payload_bytes as u64).read_to_end(&mut payload)?;
+        if payload.len() < payload_bytes {
+            return Err(io::ErrorKind::UnexpectedEof.into());
+        }
+        Ok((header, Bytes::from(payload)))
+    }
+
+    fn arrived(&self) -> MutexGuard<'_, HashMap<ContentHash, Option<Bytes>>> {
+        self.arrived.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
