@@ -6,10 +6,10 @@ use std::{collections::HashMap, time::Duration};
 
 use farm_core::{
     coordinator::{
-        CoordinatorMachine, Effect, Event, FarmStatus,
+        ContentsStatus, CoordinatorMachine, Effect, Event, FarmStatus,
         timeline::{Timeline, TimelineQuery},
     },
-    id::{LinkId, NodeId},
+    id::{ContentHash, LinkId, NodeId},
     message::{AppToCoordinator, CoordinatorToApp, CoordinatorToNode, NodeToCoordinator},
     time::Instant,
 };
@@ -30,6 +30,8 @@ use crate::{
 pub(crate) const QUEUED_COMMANDS: usize = 1_024;
 /// Messages that wait to be sent to one peer; a peer that lets this many gather is closed.
 pub(crate) const QUEUED_MESSAGES: usize = 1_024;
+/// Contents listed at once; further ones are counted.
+const MAX_LISTED_CONTENTS: usize = 4_096;
 /// Commands taken at once.
 const BURST_COMMANDS: usize = 256;
 
@@ -49,6 +51,10 @@ pub(crate) enum Command {
     Status(oneshot::Sender<FarmStatus>),
     /// Asks a node to leave; answered with whether there is such a node.
     Drain(NodeId, oneshot::Sender<bool>),
+    /// Asks what large contents nodes hold.
+    Contents(oneshot::Sender<ContentsStatus>),
+    /// Asks nodes to drop contents; answered with whether there is such a node.
+    Evict(Option<NodeId>, Vec<ContentHash>, oneshot::Sender<bool>),
     /// Asks what ran when and where.
     Timeline(TimelineQuery, oneshot::Sender<Timeline>),
     /// Somebody is no member any more, or under another key: its sessions end.
@@ -183,14 +189,26 @@ impl Owner {
             // An asker that went away needs no answer.
             Command::Status(answer) => drop(answer.send(self.machine.status())),
             Command::Timeline(query, answer) => drop(answer.send(self.machine.timeline(query))),
+            Command::Contents(answer) => drop(answer.send(self.machine.contents(MAX_LISTED_CONTENTS))),
             Command::Drain(node, answer) => {
-                let known = self.machine.status().nodes.iter().any(|known| known.node == node);
+                let known = self.knows(node);
                 if known {
                     self.machine.handle(now, Event::DrainRequested { node });
                 }
                 let _ = answer.send(known);
             }
+            Command::Evict(node, contents, answer) => {
+                let known = node.is_none_or(|node| self.knows(node));
+                if known {
+                    self.machine.handle(now, Event::EvictRequested { node, contents });
+                }
+                let _ = answer.send(known);
+            }
         }
+    }
+
+    fn knows(&self, node: NodeId) -> bool {
+        self.machine.status().nodes.iter().any(|known| known.node == node)
     }
 
     /// Carries out every effect, those of the connections that broke meanwhile too.
@@ -282,6 +300,20 @@ impl OwnerHandle {
     pub(crate) async fn drain(&self, node: NodeId) -> Option<bool> {
         let (answer, known) = oneshot::channel();
         self.0.send(Command::Drain(node, answer)).await.ok()?;
+        known.await.ok()
+    }
+
+    /// `None` once the owner has stopped.
+    pub(crate) async fn contents(&self) -> Option<ContentsStatus> {
+        let (answer, contents) = oneshot::channel();
+        self.0.send(Command::Contents(answer)).await.ok()?;
+        contents.await.ok()
+    }
+
+    /// Whether there is such a node; `None` once the owner has stopped.
+    pub(crate) async fn evict(&self, node: Option<NodeId>, contents: Vec<ContentHash>) -> Option<bool> {
+        let (answer, known) = oneshot::channel();
+        self.0.send(Command::Evict(node, contents, answer)).await.ok()?;
         known.await.ok()
     }
 

@@ -15,7 +15,7 @@ use farm_core::{
     message::{AppToCoordinator, CoordinatorToApp, CoordinatorToNode, NodeToCoordinator},
 };
 use proto::control::{
-    CAPABILITY_METADATA, WireError,
+    CAPABILITY_METADATA, WireError, eviction,
     v1::{self, admin_server::Admin, apps_server::Apps, nodes_server::Nodes},
 };
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc, oneshot};
@@ -191,6 +191,29 @@ impl Admin for Sessions {
                 Ok(Response::new(v1::DrainResponse {}))
             }
             false => Err(Status::not_found(format!("{node} is not registered"))),
+        }
+    }
+
+    async fn contents(
+        &self,
+        request: Request<v1::ContentsRequest>,
+    ) -> Result<Response<v1::ContentsStatus>, Status> {
+        self.gate.admit(request.extensions(), Action::Look)?;
+        let contents = self.owner.contents().await.ok_or_else(stopping)?;
+        Ok(Response::new(contents.into()))
+    }
+
+    async fn evict(&self, request: Request<v1::EvictRequest>) -> Result<Response<v1::EvictResponse>, Status> {
+        let operator = self.gate.admit(request.extensions(), Action::Operate)?;
+        let (node, contents) =
+            eviction(request.into_inner()).map_err(|error| Status::invalid_argument(error.to_string()))?;
+        let what = serde_json::json!({ "node": node.map(|node| node.0), "contents": contents.len() });
+        match self.owner.evict(node, contents).await.ok_or_else(stopping)? {
+            true => {
+                self.gate.done("evict", operator.as_ref(), what);
+                Ok(Response::new(v1::EvictResponse {}))
+            }
+            false => Err(Status::not_found(format!("{} is not registered", node.unwrap_or(NodeId(0))))),
         }
     }
 

@@ -13,8 +13,8 @@ use farm_core::{
     device::{DeviceInfo, DeviceKind, Features, Limits, Requirements},
     id::{BatchId, Epoch, JobIndex, NodeId, NodeSession, TaskId},
     message::{
-        AppHello, AppToCoordinator, Contact, CoordinatorToApp, CoordinatorToNode, CostNs, NodeHello,
-        NodeToCoordinator, PROTOCOL_VERSION, PlanJob, PlanRequest, WaitReason,
+        AppHello, AppToCoordinator, CacheFigures, Contact, CoordinatorToApp, CoordinatorToNode, CostNs,
+        NodeHello, NodeToCoordinator, PROTOCOL_VERSION, PlanJob, PlanRequest, WaitReason,
     },
 };
 use proto::control::{self, Session, SessionError, v1};
@@ -104,7 +104,12 @@ async fn an_app_and_a_node_meet_through_sessions() {
     assert_eq!(plan.nodes[0].devices.iter().map(|device| device.jobs.len()).sum::<usize>(), 4_096);
 
     node.sender
-        .try_send(NodeToCoordinator::Heartbeat { sequence: 9, devices: Vec::new(), spool_bytes: 0 })
+        .try_send(NodeToCoordinator::Heartbeat {
+            sequence: 9,
+            devices: Vec::new(),
+            spool_bytes: 0,
+            cache: CacheFigures::default(),
+        })
         .unwrap();
     loop {
         match node.receiver.recv().await.unwrap() {

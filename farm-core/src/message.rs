@@ -344,6 +344,31 @@ pub struct RunningJob {
     pub for_ns: u64,
 }
 
+/// A node's cache of task allocations and modules; counts are since the node started.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct CacheFigures {
+    /// Contents in memory.
+    pub memory_contents: u64,
+    /// Their bytes.
+    pub memory_bytes: u64,
+    /// Contents on disk, those in memory too.
+    pub disk_contents: u64,
+    /// Their bytes.
+    pub disk_bytes: u64,
+    /// Contents that jobs needed and that were in memory.
+    pub memory_hits: u64,
+    /// Contents that jobs needed and that were on disk.
+    pub disk_hits: u64,
+    /// Contents that were fetched from elsewhere.
+    pub fetches: u64,
+    /// Their bytes.
+    pub fetched_bytes: u64,
+    /// Contents that went from memory to make room.
+    pub memory_evictions: u64,
+    /// Contents that went from the disk to make room.
+    pub disk_evictions: u64,
+}
+
 /// Node to coordinator.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub enum NodeToCoordinator {
@@ -357,6 +382,8 @@ pub enum NodeToCoordinator {
         devices: Vec<DeviceLoad>,
         /// Executed results not yet acknowledged, in bytes.
         spool_bytes: u64,
+        /// How the node's cache of contents stands.
+        cache: CacheFigures,
     },
     /// What ended since the last report. Batched by the machine: every 5 ms or 64 jobs.
     Report {
@@ -392,7 +419,7 @@ pub enum NodeToCoordinator {
     /// asked for and is not needed any more is gone, too.
     CacheChanged {
         /// Can be fetched here.
-        held: Vec<ContentHash>,
+        held: Vec<Content>,
         /// Cannot.
         gone: Vec<ContentHash>,
     },
@@ -447,6 +474,11 @@ pub enum CoordinatorToNode {
         content: ContentHash,
         /// A node that has it; `None`: from the application.
         peer: Option<Contact>,
+    },
+    /// Drop these contents, in memory and on disk, where no job needs them; all such if none is named.
+    Evict {
+        /// Which.
+        contents: Vec<ContentHash>,
     },
     /// Take no new work, finish what runs, say goodbye.
     Drain,

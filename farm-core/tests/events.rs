@@ -11,10 +11,10 @@ use farm_core::{
     },
     ledger::{self, Ledger, SubmittedJob},
     message::{
-        AppHello, AppToCoordinator, AppToNode, Contact, CoordinatorToApp, CoordinatorToNode, CostNs,
-        DevicePlan, Executed, HeldJob, JobFailure, JobTicket, JobTrace, LatencyClass, Liveness, NodeHello,
-        NodePlan, NodeToApp, NodeToCoordinator, PROTOCOL_VERSION, Plan, PlanJob, PlanRequest, Priority,
-        ResultAck, ResultHeader, WaitReason,
+        AppHello, AppToCoordinator, AppToNode, CacheFigures, Contact, CoordinatorToApp, CoordinatorToNode,
+        CostNs, DevicePlan, Executed, HeldJob, JobFailure, JobTicket, JobTrace, LatencyClass, Liveness,
+        NodeHello, NodePlan, NodeToApp, NodeToCoordinator, PROTOCOL_VERSION, Plan, PlanJob, PlanRequest,
+        Priority, ResultAck, ResultHeader, WaitReason,
     },
     program::Content,
     time::Instant,
@@ -144,6 +144,7 @@ fn coordinator_event(step: Step) -> coordinator::Event {
             sequence: 1,
             devices: vec![farm_core::message::DeviceLoad::default(); step.two.into()],
             spool_bytes: 0,
+            cache: CacheFigures::default(),
         }),
         7 | 9 => from_node(NodeToCoordinator::Report {
             sent_at: Instant(u64::from(step.four)),
@@ -174,11 +175,15 @@ fn coordinator_event(step: Step) -> coordinator::Event {
         }),
         18 => from_node(NodeToCoordinator::Locate(content(step.three))),
         19 => from_node(NodeToCoordinator::CacheChanged {
-            held: (0..step.three).map(|tag| content(tag).hash).collect(),
+            held: (0..step.three).map(content).collect(),
             gone: (0..step.four).map(|tag| content(tag).hash).collect(),
         }),
         13 if step.four == 0 => from_node(NodeToCoordinator::Goodbye),
         15 => coordinator::Event::DrainRequested { node: NodeId(step.two.into()) },
+        20 => coordinator::Event::EvictRequested {
+            node: step.three.is_multiple_of(2).then_some(NodeId(step.two.into())),
+            contents: (0..step.four).map(|tag| content(tag).hash).collect(),
+        },
         _ => coordinator::Event::LinkClosed { link },
     }
 }
@@ -195,6 +200,7 @@ fn worker_machine() -> WorkerMachine {
         spool_quota_bytes: 20,
         local_stealing: true,
         share: worker::Share::DEFAULT,
+        cached: vec![content(1)],
         seed: 1,
     })
 }
@@ -307,6 +313,7 @@ fn drain_worker(machine: &mut WorkerMachine, handed: &mut Vec<(JobAttempt, Devic
             | worker::Effect::CloseApp { .. }
             | worker::Effect::Fetch { .. }
             | worker::Effect::Release(_)
+            | worker::Effect::Evict(_)
             | worker::Effect::Exit => {}
         }
     }

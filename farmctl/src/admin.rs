@@ -2,17 +2,17 @@
 
 use farm_core::{
     coordinator::{
-        FarmStatus,
+        ContentsStatus, FarmStatus, NodeStatus,
         timeline::{Timeline, TimelineQuery},
     },
-    id::NodeId,
+    id::{ContentHash, NodeId},
 };
 use proto::{
     control::{self, Invitation, SessionError, v1::TokenStatus},
     trust::{Identity, JoinToken},
 };
 
-use crate::{failure::Failure, target::Reach};
+use crate::{failure::Failure, output::printable, target::Reach};
 
 /// The coordinator that operator verbs talk to.
 #[derive(Debug)]
@@ -33,6 +33,36 @@ impl Admin {
     pub(crate) async fn status(&self) -> Result<FarmStatus, Failure> {
         let (address, identity) = self.to();
         control::status(address, identity).await.map_err(failure)
+    }
+
+    /// The node of this name or id.
+    pub(crate) async fn find_node(&self, wanted: &str) -> Result<NodeStatus, Failure> {
+        let mut nodes = self.status().await?.nodes;
+        let is_it = |node: &NodeStatus| {
+            node.name == wanted || node.node.to_string() == wanted || node.node.0.to_string() == wanted
+        };
+        match nodes.iter().position(is_it) {
+            Some(position) => Ok(nodes.swap_remove(position)),
+            None => {
+                let names: Vec<String> = nodes.iter().map(|node| printable(&node.name)).collect();
+                Err(Failure::Work(anyhow::anyhow!(
+                    "there is no node {wanted:?}; the farm has: {}",
+                    if names.is_empty() { "none".to_owned() } else { names.join(", ") }
+                )))
+            }
+        }
+    }
+
+    /// What large contents nodes hold.
+    pub(crate) async fn contents(&self) -> Result<ContentsStatus, Failure> {
+        let (address, identity) = self.to();
+        control::contents(address, identity).await.map_err(failure)
+    }
+
+    /// Has nodes drop contents that no job needs.
+    pub(crate) async fn evict(&self, node: Option<NodeId>, contents: &[ContentHash]) -> Result<(), Failure> {
+        let (address, identity) = self.to();
+        control::evict(address, identity, node, contents).await.map_err(failure)
     }
 
     /// What ran when and where.

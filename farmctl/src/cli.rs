@@ -91,6 +91,9 @@ pub(crate) enum Verb {
     /// Look after nodes.
     #[command(subcommand)]
     Node(NodeVerb),
+    /// Look after the caches of nodes.
+    #[command(subcommand)]
+    Cache(CacheVerb),
     /// Secure a farm: make its authority in a coordinator's state folder, and you its first operator.
     Init(InitArgs),
     /// Become a member of a secured farm, by a token of its operator.
@@ -314,6 +317,28 @@ pub(crate) enum NodeVerb {
     Drain {
         /// The node's name or id.
         node: String,
+    },
+}
+
+#[derive(Debug, Subcommand)]
+pub(crate) enum CacheVerb {
+    /// List what nodes keep of task allocations and modules, in memory and on disk.
+    Ls {
+        /// How to print it.
+        #[arg(short, long, value_enum)]
+        output: Option<Format>,
+    },
+    /// Have nodes drop contents that no job needs.
+    Evict {
+        /// The beginning of a content's digest, as `farmctl cache ls` shows it; repeat it for each.
+        #[arg(value_name = "CONTENT", required_unless_present = "all", conflicts_with = "all")]
+        contents: Vec<String>,
+        /// Everything that no job needs.
+        #[arg(long)]
+        all: bool,
+        /// Only of this node: its name or id.
+        #[arg(long, value_name = "NODE")]
+        node: Option<String>,
     },
 }
 

@@ -65,6 +65,7 @@ fn run(cli: &Cli) -> Result<(), Failure> {
             Verb::Status(arguments) => command::status::run(arguments, target, cli.output).await,
             Verb::Timeline(arguments) => command::timeline::run(arguments, target, cli.output).await,
             Verb::Node(verb) => command::node::run(verb, target).await,
+            Verb::Cache(verb) => command::cache::run(verb, target, cli.output).await,
             Verb::Init(arguments) => command::membership::init(arguments, target),
             Verb::Join(arguments) => command::membership::join(arguments, target).await,
             Verb::Token(verb) => command::membership::token(verb, target, cli.output).await,

@@ -6,7 +6,7 @@ use std::fmt;
 
 use farm_core::{
     coordinator::{
-        AppStatus, DeviceStatus, FarmStatus, NodeState, NodeStatus,
+        AppStatus, ContentStatus, ContentsStatus, DeviceStatus, FarmStatus, NodeState, NodeStatus,
         timeline::{Migration, Outcome, Segment, TimelineApp, TimelineHead, TimelineNode},
     },
     device::{DeviceInfo, DeviceKind, Features, Limits, Requirements, SimulatedDevices},
@@ -15,8 +15,8 @@ use farm_core::{
         JobIndex, NodeId, NodeSession, StealId, TaskId,
     },
     message::{
-        AppHello, AppToCoordinator, Contact, CoordinatorToApp, CoordinatorToNode, CostNs, DeviceLoad,
-        DevicePlan, Executed, HeldJob, JobFailure, JobTrace, Liveness, NodeHello, NodePlan,
+        AppHello, AppToCoordinator, CacheFigures, Contact, CoordinatorToApp, CoordinatorToNode, CostNs,
+        DeviceLoad, DevicePlan, Executed, HeldJob, JobFailure, JobTrace, Liveness, NodeHello, NodePlan,
         NodeToCoordinator, Plan, PlanJob, PlanRequest, RunningJob, WaitReason,
     },
     program::Content,
@@ -106,10 +106,12 @@ fn liveness() -> impl Strategy<Value = Liveness> {
     })
 }
 
+fn content() -> impl Strategy<Value = Content> {
+    any::<([u8; 32], u64)>().prop_map(|(hash, size_bytes)| Content { hash: ContentHash(hash), size_bytes })
+}
+
 fn contents() -> impl Strategy<Value = Vec<Content>> {
-    let content = any::<([u8; 32], u64)>()
-        .prop_map(|(hash, size_bytes)| Content { hash: ContentHash(hash), size_bytes });
-    vec(content, 0..5)
+    vec(content(), 0..5)
 }
 
 fn failure() -> impl Strategy<Value = JobFailure> {
@@ -249,9 +251,16 @@ fn node_to_coordinator() -> impl Strategy<Value = NodeToCoordinator> {
     });
     prop_oneof![
         hello,
-        (any::<(u64, u64)>(), vec(load, 0..9)).prop_map(|((sequence, spool_bytes), devices)| {
-            NodeToCoordinator::Heartbeat { sequence, devices, spool_bytes }
+        (any::<(u64, u64)>(), vec(load, 0..9), cache()).prop_map(
+            |((sequence, spool_bytes), devices, cache)| {
+                NodeToCoordinator::Heartbeat { sequence, devices, spool_bytes, cache }
+            }
+        ),
+        (vec(content(), 0..9), vec(content(), 0..9)).prop_map(|(held, gone)| {
+            let gone = gone.into_iter().map(|content| content.hash).collect();
+            NodeToCoordinator::CacheChanged { held, gone }
         }),
+        content().prop_map(NodeToCoordinator::Locate),
         (executed, attempts()).prop_map(|(executed, delivered)| NodeToCoordinator::Report {
             sent_at: SENT_AT,
             executed,
@@ -273,6 +282,29 @@ fn node_to_coordinator() -> impl Strategy<Value = NodeToCoordinator> {
     ]
 }
 
+fn cache() -> impl Strategy<Value = CacheFigures> {
+    any::<[u64; 10]>().prop_map(|counts| CacheFigures {
+        memory_contents: counts[0],
+        memory_bytes: counts[1],
+        disk_contents: counts[2],
+        disk_bytes: counts[3],
+        memory_hits: counts[4],
+        disk_hits: counts[5],
+        fetches: counts[6],
+        fetched_bytes: counts[7],
+        memory_evictions: counts[8],
+        disk_evictions: counts[9],
+    })
+}
+
+fn contents_status() -> impl Strategy<Value = ContentsStatus> {
+    let held = (content(), vec(any::<u64>(), 0..5)).prop_map(|(content, nodes)| ContentStatus {
+        content,
+        nodes: nodes.into_iter().map(NodeId).collect(),
+    });
+    (vec(held, 0..9), any::<u64>()).prop_map(|(contents, omitted)| ContentsStatus { contents, omitted })
+}
+
 fn coordinator_to_node() -> impl Strategy<Value = CoordinatorToNode> {
     prop_oneof![
         (any::<(u64, u32)>(), liveness()).prop_map(|((node, epoch), liveness)| CoordinatorToNode::Welcome {
@@ -287,6 +319,9 @@ fn coordinator_to_node() -> impl Strategy<Value = CoordinatorToNode> {
         attempts().prop_map(|jobs| CoordinatorToNode::Cancel { jobs }),
         (any::<u64>(), attempts())
             .prop_map(|(steal, jobs)| CoordinatorToNode::Retract { steal: StealId(steal), jobs }),
+        vec(content(), 0..9).prop_map(|contents| CoordinatorToNode::Evict {
+            contents: contents.into_iter().map(|content| content.hash).collect()
+        }),
         Just(CoordinatorToNode::Drain),
         any::<u64>().prop_map(|sequence| CoordinatorToNode::HeartbeatAck { sequence }),
     ]
@@ -303,16 +338,18 @@ fn farm_status() -> impl Strategy<Value = FarmStatus> {
             running_jobs,
             executed_jobs: counts[1],
             device_time_ns: counts[2],
+            lost: counts[0].is_multiple_of(2),
         },
     );
     let state = prop::sample::select(vec![NodeState::Alive, NodeState::Suspect, NodeState::Draining]);
-    let node = (any::<u64>(), "\\PC{0,20}", state, vec("[a-z0-9.:]{1,30}", 0..3), vec(device, 0..4))
-        .prop_map(|(node, name, state, addresses, devices)| NodeStatus {
+    let node = (any::<u64>(), "\\PC{0,20}", state, vec("[a-z0-9.:]{1,30}", 0..3), vec(device, 0..4), cache())
+        .prop_map(|(node, name, state, addresses, devices, cache)| NodeStatus {
             node: NodeId(node),
             name,
             state,
             addresses,
             devices,
+            cache,
         });
     let app = (any::<(u64, bool, [u64; 4])>(), "\\PC{0,20}", positive()).prop_map(
         |((app, connected, counts), name, weight)| AppStatus {
@@ -418,6 +455,11 @@ proptest! {
     }
 
     #[test]
+    fn contents_status_comes_back(status in contents_status()) {
+        prop_assert_eq!(over_the_wire::<_, v1::ContentsStatus>(status.clone()), status);
+    }
+
+    #[test]
     fn any_bytes_give_an_answer(bytes in vec(any::<u8>(), 0..200)) {
         // Whatever the answers are, there are some.
         let _ = v1::AppToCoordinator::decode(&bytes[..]).map(AppToCoordinator::try_from);
@@ -427,6 +469,7 @@ proptest! {
         let _ = v1::TimelineHead::decode(&bytes[..]).map(TimelineHead::try_from);
         let _ = v1::TimelineSegments::decode(&bytes[..]).map(Vec::<Segment>::try_from);
         let _ = v1::FarmStatus::decode(&bytes[..]).map(FarmStatus::try_from);
+        let _ = v1::ContentsStatus::decode(&bytes[..]).map(ContentsStatus::try_from);
     }
 
     #[test]

@@ -3,13 +3,15 @@
 
 use std::{
     collections::HashMap,
+    io,
+    pin::Pin,
     sync::Arc,
     time::{Duration, Instant, SystemTime},
 };
 
 use bytes::Bytes;
 use farm_core::{
-    id::{ContentHash, DeviceIndex, JobAttempt, LinkId, NodeId},
+    id::{DeviceIndex, JobAttempt, LinkId, NodeId},
     message::{AppToNode, CoordinatorToNode, JobFailure, LatencyClass, NodeToApp, NodeToCoordinator},
     program::Content,
     time,
@@ -28,7 +30,7 @@ use tokio::{
 
 use crate::{
     End, WorkerOptions,
-    content::ContentCache,
+    contents::{Contents, Fetched},
     device::{Device, DeviceEvent, DeviceNews},
     executor::{Executor, Order},
     link::{self, Outbox},
@@ -61,7 +63,9 @@ pub(crate) enum Input {
     /// An application's link is over.
     LinkEnded { link: LinkId },
     /// A fetch is through.
-    Fetched { content: Content, result: Result<Bytes, String> },
+    Fetched { content: Content, fetched: Fetched },
+    /// A content has been written to disk, or not.
+    Stored { content: Content, result: io::Result<()> },
     /// The process was asked to end in order.
     Drain,
 }
@@ -71,7 +75,7 @@ pub(crate) struct Setup {
     pub(crate) options: WorkerOptions,
     pub(crate) config: WorkerConfig,
     pub(crate) devices: Vec<Executor>,
-    pub(crate) contents: ContentCache,
+    pub(crate) contents: Contents,
     /// Unbounded for its senders, who must not wait; a device has at most six jobs, two events of each, and two an interruption.
     pub(crate) events: mpsc::UnboundedReceiver<DeviceEvent>,
     pub(crate) server: Arc<DataServer>,
@@ -93,9 +97,7 @@ struct Driver {
     serial: u64,
     links: HashMap<LinkId, Outbox>,
     devices: Vec<Device>,
-    contents: ContentCache,
-    /// Fetches on the way, and whether the machine still waits for them.
-    fetching: HashMap<ContentHash, bool>,
+    contents: Contents,
     payloads: Payloads,
     /// Failures that the driver itself found, to be told to the machine in the next turn.
     found: Vec<Event>,
@@ -129,15 +131,13 @@ pub(crate) async fn drive(setup: Setup) -> End {
         serial: 0,
         links: HashMap::new(),
         devices: devices.into_iter().map(Device::new).collect(),
-        fetching: HashMap::new(),
         payloads: Payloads::default(),
         found: Vec::new(),
         registered: Some(registered),
         end: None,
         tasks: JoinSet::new(),
     };
-    let shelf = driver.contents.shelf().clone();
-    driver.tasks.spawn(link::accept(Arc::clone(&server), shelf, inputs));
+    driver.tasks.spawn(link::accept(Arc::clone(&server), driver.contents.source(), inputs));
     if let Some(identity) = &driver.options.identity {
         driver.tasks.spawn(session::stay_valid(driver.options.coordinator.clone(), identity.clone()));
     }
@@ -160,6 +160,9 @@ pub(crate) async fn drive(setup: Setup) -> End {
         }
         for event in heard.drain(..) {
             driver.heard(event);
+        }
+        if let Some(figures) = driver.contents.news() {
+            driver.tell(Event::CacheCounted(figures));
         }
         driver.act_on_timers();
     };
@@ -231,7 +234,14 @@ impl Driver {
                 self.links.remove(&link);
                 self.tell(Event::AppLinkClosed { link });
             }
-            Input::Fetched { content, result } => self.fetched(content, result),
+            Input::Fetched { content, fetched } => {
+                let events = self.contents.fetched(content, fetched, &self.inputs);
+                events.into_iter().for_each(|event| self.tell(event));
+            }
+            Input::Stored { content, result } => {
+                let events = self.contents.stored(content, result);
+                events.into_iter().for_each(|event| self.tell(event));
+            }
             Input::Drain => self.tell(Event::DrainRequested),
         }
     }
@@ -261,6 +271,7 @@ impl Driver {
             | CoordinatorToNode::Cancel { .. }
             | CoordinatorToNode::Retract { .. }
             | CoordinatorToNode::Located { .. }
+            | CoordinatorToNode::Evict { .. }
             | CoordinatorToNode::Drain
             | CoordinatorToNode::HeartbeatAck { .. } => {}
         }
@@ -407,12 +418,8 @@ impl Driver {
                 }
             }
             Effect::Discard(job) => self.payloads.discard(job),
-            Effect::Release(hash) => {
-                self.contents.release(hash);
-                if let Some(wanted) = self.fetching.get_mut(&hash) {
-                    *wanted = false;
-                }
-            }
+            Effect::Release(hash) => self.contents.release(hash),
+            Effect::Evict(contents) => self.found.extend(self.contents.evict(&contents)),
             // After a refusal the machine exits too; the refusal is the reason.
             Effect::Exit => {
                 self.end.get_or_insert(End::Drained);
@@ -434,55 +441,21 @@ impl Driver {
             self.found.push(Event::ContentReady(content.hash));
             return;
         }
-        if self.fetching.insert(content.hash, true).is_some() {
-            return;
-        }
-        let inputs = self.inputs.clone();
-        // Without a driver the worker has ended.
-        match from {
+        let fetch: Pin<Box<dyn Future<Output = Result<Bytes, String>> + Send>> = match from {
             Provider::Application(link) => {
                 let Some(outbox) = self.links.get(&link) else {
-                    self.fetching.remove(&content.hash);
                     let reason = "its application's link is over".to_owned();
                     self.found.push(Event::ContentFailed { content: content.hash, reason });
                     return;
                 };
                 let sender = outbox.sender().clone();
-                tokio::spawn(async move {
-                    let result = sender.fetch(content).await.map_err(|error| error.to_string());
-                    let _ = inputs.send(Input::Fetched { content, result }).await;
-                });
+                Box::pin(async move { sender.fetch(content).await.map_err(|error| error.to_string()) })
             }
             Provider::Node(contact) => {
-                let identity = self.options.identity.clone();
-                tokio::spawn(async move {
-                    let result = link::fetch_from_peer(contact, identity, content).await;
-                    let _ = inputs.send(Input::Fetched { content, result }).await;
-                });
+                Box::pin(link::fetch_from_peer(contact, self.options.identity.clone(), content))
             }
-        }
-    }
-
-    fn fetched(&mut self, content: Content, result: Result<Bytes, String>) {
-        let wanted = self.fetching.remove(&content.hash).unwrap_or(false);
-        let failed = |reason: String| Event::ContentFailed { content: content.hash, reason };
-        let event = match result {
-            Ok(bytes) => match self.contents.insert(content.hash, bytes, |hash| {
-                self.found.push(Event::ContentEvicted(hash));
-            }) {
-                Ok(()) => Event::ContentReady(content.hash),
-                Err(full) => failed(format!(
-                    "the content cache of {} B is full of contents in use ({} B)",
-                    full.cap_bytes, full.pinned_bytes
-                )),
-            },
-            Err(reason) => failed(reason),
         };
-        if wanted {
-            self.tell(event);
-        } else {
-            self.contents.release(content.hash);
-        }
+        self.contents.fetch(content, fetch, self.inputs.clone());
     }
 
     fn execute(&mut self, job: JobAttempt, index: DeviceIndex, class: LatencyClass) {

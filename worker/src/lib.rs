@@ -3,7 +3,7 @@
 //! It owns sockets, clocks, payload bytes (programs, contents, results) and the devices' executors; it decides
 //! nothing about jobs. One task owns the machine; everything else sends it inputs.
 
-mod content;
+mod contents;
 mod device;
 mod driver;
 mod executor;
@@ -33,7 +33,7 @@ use tokio::{
 
 pub use self::executor::{Isolation, serve_if_executor};
 use self::{
-    content::ContentCache,
+    contents::Contents,
     driver::{Input, QUEUED_INPUTS, Setup},
 };
 
@@ -69,8 +69,10 @@ pub struct WorkerOptions {
     pub share: Share,
     /// Who this node is in a secured farm; without it, everyone who reaches it can use it.
     pub identity: Option<Identity>,
-    /// A folder for caches on disk. Checked to be writable; what is cached there comes with a later version.
+    /// A folder for caches on disk: contents that come from elsewhere are kept there over restarts.
     pub cache: Option<PathBuf>,
+    /// Most bytes of contents kept there.
+    pub disk_cache_bytes: u64,
 }
 
 impl WorkerOptions {
@@ -92,6 +94,7 @@ impl WorkerOptions {
             share: Share::DEFAULT,
             identity: None,
             cache: None,
+            disk_cache_bytes: 32 << 30,
         }
     }
 }
@@ -226,11 +229,8 @@ impl Drop for WorkerHandle {
 /// # Errors
 /// A device or address cannot be had, or the coordinator cannot be reached in time or refuses.
 pub async fn start(options: WorkerOptions) -> Result<WorkerHandle, StartError> {
-    if let Some(path) = &options.cache {
-        check_cache(path).map_err(|source| StartError::Cache { path: path.clone(), source })?;
-    }
     let (events_sender, events) = mpsc::unbounded_channel();
-    let contents = ContentCache::new(options.content_cache_bytes);
+    let contents = open_contents(&options).await?;
     let opened =
         executor::open(options.devices.clone(), &options.isolation, contents.shelf(), &events_sender).await?;
     let (devices, infos): (_, Vec<DeviceInfo>) = opened.into_iter().unzip();
@@ -249,6 +249,7 @@ pub async fn start(options: WorkerOptions) -> Result<WorkerHandle, StartError> {
         spool_quota_bytes: options.spool_quota_bytes,
         local_stealing: options.local_stealing,
         share: options.share,
+        cached: contents.on_disk(),
         seed: identity,
     };
     let session = session::first(&options.coordinator, options.identity.as_ref(), options.connect_timeout)
@@ -293,6 +294,21 @@ pub async fn start(options: WorkerOptions) -> Result<WorkerHandle, StartError> {
     };
     let info = WorkerInfo { name: options.name, node, data, contact, devices: infos };
     Ok(WorkerHandle { info, inputs, driver })
+}
+
+/// Opens the caches; a large folder takes its time.
+async fn open_contents(options: &WorkerOptions) -> Result<Contents, StartError> {
+    let (cap_bytes, disk_bytes) = (options.content_cache_bytes, options.disk_cache_bytes);
+    let Some(path) = options.cache.clone() else {
+        let memory_alone = Contents::open(cap_bytes, None);
+        return Ok(memory_alone?);
+    };
+    let opening = tokio::task::spawn_blocking(move || {
+        check_cache(&path)
+            .and_then(|()| Contents::open(cap_bytes, Some((&path, disk_bytes))))
+            .map_err(|source| StartError::Cache { path, source })
+    });
+    opening.await.map_err(std::io::Error::other)?
 }
 
 fn check_cache(path: &std::path::Path) -> std::io::Result<()> {

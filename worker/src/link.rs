@@ -18,20 +18,20 @@ use proto::{
 };
 use tokio::sync::mpsc;
 
-use crate::{content::Shelf, driver::Input};
+use crate::driver::Input;
 
 /// Frames taken from a link at once.
 const FRAMES_PER_READ: usize = 64;
 
 /// Accepts applications and nodes until the server shuts down.
-pub(crate) async fn accept(server: Arc<DataServer>, shelf: Shelf, inputs: mpsc::Sender<Input>) {
+pub(crate) async fn accept(server: Arc<DataServer>, contents: ContentSource, inputs: mpsc::Sender<Input>) {
     let mut next = 0;
     while let Some(incoming) = server.accept().await {
         let link = LinkId(next);
         next += 1;
-        let (inputs, shelf) = (inputs.clone(), shelf.clone());
+        let (inputs, contents) = (inputs.clone(), contents.clone());
         tokio::spawn(async move {
-            match incoming.establish(|peer| fetchable(shelf, peer)).await {
+            match incoming.establish(|peer| fetchable(contents, peer)).await {
                 Ok((Link { sender, receiver }, peer)) => read(link, sender, receiver, peer, inputs).await,
                 Err(error) => tracing::debug!(%link, %error, "a link was not made"),
             }
@@ -40,14 +40,14 @@ pub(crate) async fn accept(server: Arc<DataServer>, shelf: Shelf, inputs: mpsc::
 }
 
 /// What a peer may fetch here: nodes, and in an open farm everyone, what they know the digest of; applications nothing.
-fn fetchable(shelf: Shelf, peer: Option<&Principal>) -> ContentSource {
+fn fetchable(contents: ContentSource, peer: Option<&Principal>) -> ContentSource {
     match peer {
-        None | Some(Principal { role: Role::Node, .. }) => ContentSource::new(move |hash| shelf.get(&hash)),
+        None | Some(Principal { role: Role::Node, .. }) => contents,
         Some(_) => ContentSource::empty(),
     }
 }
 
-/// Fetches a content from another node's shelf, on a link of its own: its handshake is little beside a large content.
+/// Fetches a content from another node, on a link of its own: its handshake is little beside a large content.
 pub(crate) async fn fetch_from_peer(
     contact: Contact,
     identity: Option<Identity>,

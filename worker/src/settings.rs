@@ -56,7 +56,8 @@ pub(crate) struct Arguments {
     /// [default: ~/.config/gleaner/node.pem, if there is one].
     #[arg(long, value_name = "FILE", env = "GLEANER_IDENTITY")]
     identity: Option<PathBuf>,
-    /// Folder for caches.
+    /// Folder for caches: task data that came from elsewhere is kept there over restarts, 32 GiB of it unless
+    /// `disk_cache_bytes` in the config file says otherwise. A folder for each worker [default: none].
     #[arg(long, value_name = "DIR", env = "GLEANER_CACHE")]
     cache: Option<PathBuf>,
     /// How long the coordinator is tried at the start, as 500ms, 30s, 5m or 1h [default: 30s].
@@ -93,6 +94,8 @@ struct ConfigFile {
     job_limit: Option<String>,
     /// Most bytes of task allocations and modules kept in memory.
     content_cache_bytes: Option<u64>,
+    /// Most bytes of them kept in the cache folder.
+    disk_cache_bytes: Option<u64>,
     /// Most bytes of results that an application may leave unacknowledged.
     spool_quota_bytes: Option<u64>,
     /// How devices are shared between applications.
@@ -167,6 +170,7 @@ pub(crate) fn options(arguments: Arguments) -> anyhow::Result<WorkerOptions> {
             CONNECT_TIMEOUT,
         )?,
         content_cache_bytes: file.content_cache_bytes.unwrap_or(defaults.content_cache_bytes),
+        disk_cache_bytes: file.disk_cache_bytes.unwrap_or(defaults.disk_cache_bytes),
         spool_quota_bytes: file.spool_quota_bytes.unwrap_or(defaults.spool_quota_bytes),
         job_limit: duration("job_limit", file.job_limit, defaults.job_limit)?,
         local_stealing: file.scheduler.local_stealing == Switch::On,
@@ -298,7 +302,7 @@ mod tests {
     fn flags_overrule_the_file() {
         let config = "coordinator = 'a:1'\nlisten = '127.0.0.1:5'\nadvertise = ['b:2']\nname = 'n'\n\
                       device = ['cpu', 'gpu:1']\ncache = '/c'\nconnect_timeout = '5m'\njob_limit = '250ms'\n\
-                      content_cache_bytes = 77\nspool_quota_bytes = 78\nshare = 'stride'\n";
+                      content_cache_bytes = 77\ndisk_cache_bytes = 79\nspool_quota_bytes = 78\nshare = 'stride'\n";
         let from_file = parse(&[], Some(config)).unwrap();
         assert_eq!((from_file.coordinator.as_str(), from_file.name.as_str()), ("a:1", "n"));
         assert_eq!(from_file.listen.to_string(), "127.0.0.1:5");
@@ -308,6 +312,7 @@ mod tests {
         assert_eq!(from_file.connect_timeout, Duration::from_secs(300));
         assert_eq!(from_file.job_limit, Duration::from_millis(250));
         assert_eq!((from_file.content_cache_bytes, from_file.spool_quota_bytes), (77, 78));
+        assert_eq!(from_file.disk_cache_bytes, 79);
         assert!(from_file.local_stealing, "on unless it is switched off");
         assert_eq!(from_file.share, Share::Stride);
 

@@ -457,10 +457,15 @@ impl Driver {
         let (waiting, out_of_reach) = (self.runs.waiting(), self.runs.is_out_of_reach());
         let coordinator =
             if self.coordinator.is_lost() { CoordinatorLink::Reconnecting } else { CoordinatorLink::Up };
-        self.progress.send_if_modified(|progress| {
-            let before = progress.clone();
-            *progress = Progress { replanned, nodes, waiting, out_of_reach, coordinator, ..before.clone() };
-            *progress != before
+        let now = (replanned, nodes, waiting, out_of_reach, coordinator);
+        // Called each turn: nothing is copied.
+        self.progress.send_if_modified(|shown| {
+            let Progress { replanned, nodes, waiting, out_of_reach, coordinator, .. } = *shown;
+            if (replanned, nodes, waiting, out_of_reach, coordinator) == now {
+                return false;
+            }
+            (shown.replanned, shown.nodes, shown.waiting, shown.out_of_reach, shown.coordinator) = now;
+            true
         });
     }
 

@@ -5,6 +5,7 @@ use std::fmt::{self, Display, Write as _};
 use farm_core::{
     coordinator::{FarmStatus, NodeState},
     device::DeviceKind,
+    message::CacheFigures,
 };
 
 /// One page of metrics.
@@ -55,9 +56,11 @@ pub(super) fn render(status: &FarmStatus) -> String {
 
     page.family("gleaner_devices", "gauge", "Devices of the registered nodes by kind.");
     for kind in [DeviceKind::Gpu, DeviceKind::Cpu, DeviceKind::Simulated] {
-        let count = devices().filter(|(_, device)| device.kind == kind).count();
+        let count = devices().filter(|(_, device)| device.kind == kind && !device.lost).count();
         page.sample("gleaner_devices", &[("kind", &kind)], count);
     }
+    page.family("gleaner_lost_devices", "gauge", "Devices that are lost until their node starts anew.");
+    page.sample("gleaner_lost_devices", &[], devices().filter(|(_, device)| device.lost).count());
 
     page.family("gleaner_apps", "gauge", "Registered applications by connection.");
     let connected = status.apps.iter().filter(|app| app.connected).count();
@@ -79,6 +82,7 @@ pub(super) fn render(status: &FarmStatus) -> String {
         let labels: [Label<'_>; 2] = [("node", &node.name), ("device", &device.device.0)];
         page.sample("gleaner_device_planned_jobs", &labels, device.planned_jobs);
     }
+    caches(&mut page, status);
     page.family(
         "gleaner_app_device_time_seconds_total",
         "counter",
@@ -89,6 +93,55 @@ pub(super) fn render(status: &FarmStatus) -> String {
         page.sample("gleaner_app_device_time_seconds_total", &labels, Seconds(app.device_time_ns));
     }
     page.0
+}
+
+/// How a kind of storage is named, and what it shows of a node's cache.
+type PerStorage = [(&'static str, fn(&CacheFigures) -> u64); 2];
+
+/// The nodes' caches of task allocations and modules.
+fn caches(page: &mut Page, status: &FarmStatus) {
+    let families: [(&str, &str, &str, PerStorage); 4] = [
+        (
+            "gleaner_cache_contents",
+            "gauge",
+            "Contents in the cache of each node.",
+            [("memory", |cache| cache.memory_contents), ("disk", |cache| cache.disk_contents)],
+        ),
+        (
+            "gleaner_cache_bytes",
+            "gauge",
+            "Their bytes.",
+            [("memory", |cache| cache.memory_bytes), ("disk", |cache| cache.disk_bytes)],
+        ),
+        (
+            "gleaner_cache_hits_total",
+            "counter",
+            "Contents that jobs needed and that were in the cache.",
+            [("memory", |cache| cache.memory_hits), ("disk", |cache| cache.disk_hits)],
+        ),
+        (
+            "gleaner_cache_evictions_total",
+            "counter",
+            "Contents that went to make room.",
+            [("memory", |cache| cache.memory_evictions), ("disk", |cache| cache.disk_evictions)],
+        ),
+    ];
+    for (name, kind, help, values) in families {
+        page.family(name, kind, help);
+        for node in &status.nodes {
+            for (storage, value) in values {
+                page.sample(name, &[("node", &node.name), ("storage", &storage)], value(&node.cache));
+            }
+        }
+    }
+    page.family("gleaner_cache_misses_total", "counter", "Contents that each node fetched from elsewhere.");
+    for node in &status.nodes {
+        page.sample("gleaner_cache_misses_total", &[("node", &node.name)], node.cache.fetches);
+    }
+    page.family("gleaner_cache_fetched_bytes_total", "counter", "Their bytes.");
+    for node in &status.nodes {
+        page.sample("gleaner_cache_fetched_bytes_total", &[("node", &node.name)], node.cache.fetched_bytes);
+    }
 }
 
 type Label<'a> = (&'a str, &'a dyn Display);
@@ -138,6 +191,10 @@ mod tests {
             "gleaner_jobs_total{outcome=\"replanned\"} 6",
             "gleaner_jobs{state=\"waiting\"} 1",
             "gleaner_nodes{state=\"alive\"} 1",
+            "gleaner_devices{kind=\"gpu\"} 1",
+            "gleaner_lost_devices 1",
+            "gleaner_cache_bytes{node=\"n<script>\",storage=\"disk\"} 77",
+            "gleaner_cache_hits_total{node=\"n<script>\",storage=\"memory\"} 5",
             "gleaner_nodes{state=\"suspect\"} 0",
             "gleaner_devices{kind=\"gpu\"} 1",
             "gleaner_apps{connected=\"true\"} 1",

@@ -97,6 +97,7 @@ pub(crate) mod samples {
         coordinator::{AppStatus, DeviceStatus, FarmStatus, NodeState, NodeStatus},
         device::DeviceKind,
         id::{AppId, DeviceIndex, Epoch, NodeId},
+        message::CacheFigures,
     };
 
     pub(crate) fn farm() -> FarmStatus {
@@ -109,13 +110,16 @@ pub(crate) mod samples {
             running_jobs: 1,
             executed_jobs: 41,
             device_time_ns: 2_500_000_000,
+            lost: false,
         };
+        let lost = DeviceStatus { device: DeviceIndex(1), lost: true, running_jobs: 0, ..device.clone() };
         let node = NodeStatus {
             node: NodeId(3),
             name: "n<script>".to_owned(),
             state: NodeState::Alive,
             addresses: vec!["127.0.0.1:1".to_owned()],
-            devices: vec![device],
+            devices: vec![device, lost],
+            cache: CacheFigures { disk_bytes: 77, memory_hits: 5, ..CacheFigures::default() },
         };
         let app = AppStatus {
             app: AppId(9),

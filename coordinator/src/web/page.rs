@@ -12,7 +12,7 @@ body { font: 15px/1.45 system-ui, sans-serif; margin: 2rem auto; max-width: 70re
 h1 { font-size: 1.4rem } h2 { font-size: 1.1rem; margin-top: 2rem }
 table { border-collapse: collapse; width: 100% } th, td { padding: .3rem .6rem; text-align: left; border-bottom: 1px solid var(--line) }
 th { color: var(--soft); font-weight: 500 } td.n, th.n { text-align: right; font-variant-numeric: tabular-nums }
-.alive { color: var(--good) } .suspect, .draining, .gone { color: var(--bad) } .none { color: var(--soft) }
+.alive { color: var(--good) } .suspect, .draining, .gone, .lost { color: var(--bad) } .none { color: var(--soft) }
 @media (prefers-color-scheme: dark) { :root { --good: #57c36f; --bad: #f0a050 } }
 </style></head><body>
 "#;
@@ -28,7 +28,7 @@ pub(super) fn render(status: &FarmStatus) -> String {
 }
 
 fn write_body(page: &mut String, status: &FarmStatus) -> fmt::Result {
-    let devices = status.nodes.iter().map(|node| node.devices.len()).sum::<usize>();
+    let devices = status.nodes.iter().flat_map(|node| &node.devices).filter(|device| !device.lost).count();
     writeln!(
         page,
         "<h1>Gleaner</h1><p>{} nodes, {devices} devices, {} applications; {} jobs delivered, {} stolen, {} replanned; {}.</p>",
@@ -74,9 +74,10 @@ fn write_nodes(page: &mut String, status: &FarmStatus) -> fmt::Result {
         for device in &node.devices {
             writeln!(
                 page,
-                "<tr>{head}<td>{} {}<td>{}<td class=n>{:.1}<td class=n>{}<td class=n>{}<td class=n>{}<td class=n>{}</tr>",
+                "<tr>{head}<td>{} {}{}<td>{}<td class=n>{:.1}<td class=n>{}<td class=n>{}<td class=n>{}<td class=n>{}</tr>",
                 device.device.0,
                 Escaped(&device.name),
+                if device.lost { " <span class=lost>lost</span>" } else { "" },
                 device.kind,
                 device.score,
                 device.planned_jobs,

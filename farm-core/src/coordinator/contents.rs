@@ -5,11 +5,12 @@
 //! from there, each then a source itself. A wait is bounded: every [`LANE_MS`] one more goes to the application.
 
 use std::{
+    cmp::Reverse,
     collections::{BTreeMap, BTreeSet, VecDeque},
     time::Duration,
 };
 
-use super::{CoordinatorMachine, model::Node};
+use super::{ContentStatus, ContentsStatus, CoordinatorMachine, model::Node};
 use crate::{
     id::{ContentHash, NodeId},
     message::CoordinatorToNode,
@@ -41,6 +42,8 @@ pub(super) struct Spreads {
 /// Where one content is and where it goes. A node is in at most one of the four.
 #[derive(Debug, Default)]
 struct Spread {
+    /// 0 while nobody has said it.
+    size_bytes: u64,
     holders: BTreeSet<NodeId>,
     /// Fetch it from the application.
     from_app: BTreeSet<NodeId>,
@@ -104,6 +107,7 @@ impl CoordinatorMachine {
             return self.send_to(node, content.hash, Source::Application);
         }
         let spread = self.spreads.contents.entry(content.hash).or_default();
+        spread.size_bytes = content.size_bytes;
         let tries = spread.vain_tries.remove(&node).unwrap_or(0);
         let failed = spread.from_peer.get(&node).copied();
         spread.forget(node);
@@ -121,14 +125,15 @@ impl CoordinatorMachine {
         &mut self,
         now: Instant,
         node: NodeId,
-        held: &[ContentHash],
+        held: &[Content],
         gone: &[ContentHash],
     ) {
-        for &hash in held {
+        for &Content { hash, size_bytes } in held {
             if self.spreads.contents.len() >= MAX_SPREADS && !self.spreads.contents.contains_key(&hash) {
                 continue;
             }
             let spread = self.spreads.contents.entry(hash).or_default();
+            spread.size_bytes = size_bytes;
             spread.forget(node);
             spread.holders.insert(node);
             self.serve(now, hash);
@@ -224,6 +229,31 @@ impl CoordinatorMachine {
     /// When [`Self::open_lanes`] wants to be called.
     pub(super) const fn lanes_due(&self) -> Option<Instant> {
         self.spreads.due
+    }
+
+    /// The contents that nodes hold, the largest first, at most `most`.
+    #[must_use]
+    pub fn contents(&self, most: usize) -> ContentsStatus {
+        let held = self.spreads.contents.iter().filter(|(_, spread)| !spread.holders.is_empty());
+        let mut contents: Vec<ContentStatus> = held
+            .map(|(&hash, spread)| ContentStatus {
+                content: Content { hash, size_bytes: spread.size_bytes },
+                nodes: spread.holders.iter().copied().collect(),
+            })
+            .collect();
+        contents.sort_by_key(|held| (Reverse(held.content.size_bytes), held.content.hash));
+        let omitted = contents.len().saturating_sub(most) as u64;
+        contents.truncate(most);
+        ContentsStatus { contents, omitted }
+    }
+
+    /// Has nodes drop contents that no job needs; all nodes if none is named, all contents if none is.
+    pub(super) fn evict(&mut self, node: Option<NodeId>, contents: &[ContentHash]) {
+        let asked: Vec<NodeId> =
+            self.nodes.keys().copied().filter(|id| node.is_none_or(|node| node == *id)).collect();
+        for id in asked {
+            self.tell_node(id, CoordinatorToNode::Evict { contents: contents.to_vec() });
+        }
     }
 
     pub(super) fn check_spreads(&self) {

@@ -40,8 +40,11 @@ use self::{
 };
 use crate::{
     device::DeviceKind,
-    id::{AppId, Attempt, BatchId, DeviceIndex, Epoch, JobId, JobKey, LinkId, NodeId, StealId},
-    message::{AppToCoordinator, CoordinatorToApp, CoordinatorToNode, Liveness, NodeToCoordinator},
+    id::{AppId, Attempt, BatchId, ContentHash, DeviceIndex, Epoch, JobId, JobKey, LinkId, NodeId, StealId},
+    message::{
+        AppToCoordinator, CacheFigures, CoordinatorToApp, CoordinatorToNode, Liveness, NodeToCoordinator,
+    },
+    program::Content,
     time::Instant,
 };
 
@@ -103,6 +106,13 @@ pub enum Event {
     DrainRequested {
         /// Which.
         node: NodeId,
+    },
+    /// An operator wants contents dropped where no job needs them.
+    EvictRequested {
+        /// Of one node; of all where none is named.
+        node: Option<NodeId>,
+        /// Which; all where none is named.
+        contents: Vec<ContentHash>,
     },
     /// A plug-in answered, or will not.
     PolicyAnswered {
@@ -177,6 +187,8 @@ pub struct DeviceStatus {
     pub executed_jobs: u64,
     /// Device time of these, nanoseconds.
     pub device_time_ns: u64,
+    /// Gone: it gets no jobs until its node starts anew.
+    pub lost: bool,
 }
 
 /// A node in [`FarmStatus`].
@@ -192,6 +204,26 @@ pub struct NodeStatus {
     pub addresses: Vec<String>,
     /// Its devices.
     pub devices: Vec<DeviceStatus>,
+    /// Its cache, by the last heartbeat.
+    pub cache: CacheFigures,
+}
+
+/// A large content (1 MiB and more) in the caches of nodes.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct ContentStatus {
+    /// Which.
+    pub content: Content,
+    /// Where it is, by id.
+    pub nodes: Vec<NodeId>,
+}
+
+/// The large contents in the caches of nodes.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct ContentsStatus {
+    /// The largest ones first.
+    pub contents: Vec<ContentStatus>,
+    /// How many more there are.
+    pub omitted: u64,
 }
 
 /// An application in [`FarmStatus`].
@@ -354,6 +386,10 @@ impl CoordinatorMachine {
                 self.link_closed(now, link);
                 None
             }
+            Event::EvictRequested { node, contents } => {
+                self.evict(node, &contents);
+                None
+            }
             Event::DrainRequested { node } => {
                 self.drain(node);
                 None
@@ -423,8 +459,8 @@ impl CoordinatorMachine {
         self.node_heard(now, node);
         match message {
             NodeToCoordinator::Hello(_) => self.protocol_error(now, link),
-            NodeToCoordinator::Heartbeat { sequence, devices, spool_bytes: _ } => {
-                self.loads_reported(node, &devices);
+            NodeToCoordinator::Heartbeat { sequence, devices, spool_bytes: _, cache } => {
+                self.loads_reported(node, &devices, cache);
                 self.consider_speculating(now, node);
                 self.tell_node(node, CoordinatorToNode::HeartbeatAck { sequence });
             }

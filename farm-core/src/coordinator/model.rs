@@ -15,7 +15,7 @@ use crate::{
         AppId, AppIncarnation, Attempt, BatchId, ContentHash, DeviceIndex, JobId, JobKey, LinkId, NodeId,
         NodeSession, StealId, TaskId,
     },
-    message::{Contact, CostNs, JobFailure, NodeHello, RunningJob, WaitReason},
+    message::{CacheFigures, Contact, CostNs, JobFailure, NodeHello, RunningJob, WaitReason},
     program::Content,
     time::Instant,
 };
@@ -169,6 +169,8 @@ pub(super) struct Node {
     pub(super) brought: BTreeMap<JobId, Brought>,
     /// Contents that its jobs named: it has them, or will soon.
     contents: BTreeSet<ContentHash>,
+    /// By the last heartbeat.
+    pub(super) cache: CacheFigures,
     /// It joined and has not stolen yet: it may take jobs of any application.
     pub(super) joining: bool,
     /// When it may try to steal again, and how often in a row it tried in vain.
@@ -191,6 +193,7 @@ impl Node {
             jobs: BTreeSet::new(),
             brought: BTreeMap::new(),
             contents: BTreeSet::new(),
+            cache: CacheFigures::default(),
             joining: true,
             steal_at: now,
             vain_steals: 0,

@@ -10,7 +10,7 @@ use super::{
 };
 use crate::{
     id::{DeviceIndex, JobAttempt, JobId, JobKey, NodeId},
-    message::{CoordinatorToNode, DeviceLoad, Executed, JobFailure},
+    message::{CacheFigures, CoordinatorToNode, DeviceLoad, Executed, JobFailure},
     time::Instant,
 };
 
@@ -33,8 +33,9 @@ impl CoordinatorMachine {
         }
     }
 
-    pub(super) fn loads_reported(&mut self, id: NodeId, loads: &[DeviceLoad]) {
+    pub(super) fn loads_reported(&mut self, id: NodeId, loads: &[DeviceLoad], cache: CacheFigures) {
         let Some(node) = self.nodes.get_mut(&id) else { return };
+        node.cache = cache;
         for (device, load) in node.devices.iter_mut().zip(loads) {
             device.running = load.running;
         }

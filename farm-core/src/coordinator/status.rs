@@ -39,8 +39,6 @@ impl CoordinatorMachine {
         let devices = |node: &super::model::Node| {
             (0_u16..)
                 .zip(&node.devices)
-                // A lost device is no device of the farm any more.
-                .filter(|(_, device)| !device.lost)
                 .map(|(index, device)| DeviceStatus {
                     device: DeviceIndex(index),
                     name: device.info.name.clone(),
@@ -50,6 +48,7 @@ impl CoordinatorMachine {
                     running_jobs: device.running.is_some().into(),
                     executed_jobs: device.executed_jobs,
                     device_time_ns: device.device_time_ns,
+                    lost: device.lost,
                 })
                 .collect()
         };
@@ -61,6 +60,7 @@ impl CoordinatorMachine {
                 state: node.state,
                 addresses: node.contact.addresses.clone(),
                 devices: devices(node),
+                cache: node.cache,
             })
             .collect()
     }

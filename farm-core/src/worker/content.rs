@@ -5,7 +5,7 @@
 //! node that has them, or the application.
 
 use std::{
-    collections::{BTreeSet, btree_map::Entry},
+    collections::{BTreeMap, BTreeSet, btree_map::Entry},
     time::Duration,
 };
 
@@ -61,6 +61,12 @@ pub(super) enum ContentState {
     },
     /// To be asked for: no link yet, or the last try failed.
     Wanted,
+}
+
+/// Those of which the coordinator is told.
+pub(super) fn large(contents: &[Content]) -> BTreeMap<ContentHash, u64> {
+    let large = contents.iter().filter(|content| content.size_bytes >= LARGE_BYTES);
+    large.map(|content| (content.hash, content.size_bytes)).collect()
 }
 
 impl WorkerMachine {
@@ -123,7 +129,7 @@ impl WorkerMachine {
         let Some(holding) = self.contents.get_mut(&hash) else { return };
         holding.state = ContentState::Ready;
         holding.failed_tries = 0;
-        let is_large = holding.content.size_bytes >= LARGE_BYTES;
+        let content = holding.content;
         for job in std::mem::take(&mut holding.waiting) {
             let Some(held) = self.jobs.get_mut(&job.job).filter(|held| held.attempt == job.attempt) else {
                 continue;
@@ -134,13 +140,13 @@ impl WorkerMachine {
                 self.enqueue(job.job);
             }
         }
-        if is_large && self.cached.insert(hash) {
-            self.tell_cache_changed(vec![hash], Vec::new());
+        if content.size_bytes >= LARGE_BYTES && self.cached.insert(hash, content.size_bytes).is_none() {
+            self.tell_cache_changed(vec![content], Vec::new());
         }
     }
 
     pub(super) fn content_evicted(&mut self, hash: ContentHash) {
-        if self.cached.remove(&hash) {
+        if self.cached.remove(&hash).is_some() {
             self.tell_cache_changed(Vec::new(), vec![hash]);
         }
     }
@@ -185,7 +191,8 @@ impl WorkerMachine {
 
     /// Registered (again): the coordinator need not know what is here.
     pub(super) fn tell_cache(&mut self) {
-        let held: Vec<ContentHash> = self.cached.iter().copied().collect();
+        let held: Vec<Content> =
+            self.cached.iter().map(|(&hash, &size_bytes)| Content { hash, size_bytes }).collect();
         for held in held.chunks(MAX_TOLD) {
             self.tell_cache_changed(held.to_vec(), Vec::new());
         }
@@ -194,7 +201,7 @@ impl WorkerMachine {
     fn may_be_located(&self, content: &Content) -> bool {
         content.size_bytes >= LARGE_BYTES
             && self.session.is_registered()
-            && !self.cached.contains(&content.hash)
+            && !self.cached.contains_key(&content.hash)
     }
 
     fn ask_where(&mut self, now: Instant, content: Content) {
@@ -214,7 +221,7 @@ impl WorkerMachine {
         }
     }
 
-    fn tell_cache_changed(&mut self, held: Vec<ContentHash>, gone: Vec<ContentHash>) {
+    fn tell_cache_changed(&mut self, held: Vec<Content>, gone: Vec<ContentHash>) {
         if self.session.is_registered() {
             self.tell_coordinator(NodeToCoordinator::CacheChanged { held, gone });
         }

@@ -26,7 +26,7 @@ mod staging;
 mod standing;
 mod stride;
 
-use std::collections::{BTreeMap, BTreeSet, VecDeque};
+use std::collections::{BTreeMap, VecDeque};
 
 use rand::{SeedableRng, rngs::SmallRng};
 
@@ -34,7 +34,7 @@ pub use self::share::Share;
 pub use self::standing::Standing;
 use self::{
     app::App,
-    content::Holding,
+    content::{Holding, large},
     device::Device,
     drain::Drain,
     job::{HeldJob, Tombstones},
@@ -46,7 +46,8 @@ use crate::{
     device::DeviceInfo,
     id::{AppId, ContentHash, DeviceIndex, JobAttempt, JobId, LinkId, NodeId, NodeSession},
     message::{
-        AppToNode, Contact, CoordinatorToNode, JobFailure, LatencyClass, NodeToApp, NodeToCoordinator,
+        AppToNode, CacheFigures, Contact, CoordinatorToNode, JobFailure, LatencyClass, NodeToApp,
+        NodeToCoordinator,
     },
     program::Content,
     time::Instant,
@@ -72,6 +73,8 @@ pub struct WorkerConfig {
     pub local_stealing: bool,
     /// How devices are shared between applications.
     pub share: Share,
+    /// Contents that the cache holds from the start.
+    pub cached: Vec<Content>,
     /// Seed of the machine's one generator.
     pub seed: u64,
 }
@@ -101,6 +104,8 @@ pub enum Event {
     ContentReady(ContentHash),
     /// The cache made room: it does not have this content any more.
     ContentEvicted(ContentHash),
+    /// The cache's figures changed.
+    CacheCounted(CacheFigures),
     /// A content could not be had.
     ContentFailed {
         /// Which.
@@ -197,6 +202,9 @@ pub enum Effect {
     Discard(JobAttempt),
     /// No queued job names this content any more; the cache may evict it.
     Release(ContentHash),
+    /// Drop these contents from the cache where they are not pinned, all such if none is named; answer with
+    /// `ContentEvicted` for each that is gone.
+    Evict(Vec<ContentHash>),
     /// Drained, goodbye said: the process may end.
     Exit,
 }
@@ -230,8 +238,10 @@ pub struct WorkerMachine {
     refetch_at: Option<Instant>,
     /// When the first of the contents whose whereabouts were asked for is fetched from its application without an answer.
     located_by: Option<Instant>,
-    /// Large contents in the cache.
-    cached: BTreeSet<ContentHash>,
+    /// Large contents in the cache, with their sizes in bytes.
+    cached: BTreeMap<ContentHash, u64>,
+    /// As the driver counted last.
+    cache: CacheFigures,
     devices: Vec<Device>,
     lags: Lags,
     share: Box<dyn FairShare>,
@@ -249,6 +259,7 @@ impl WorkerMachine {
         let devices = config.devices.iter().cloned().map(Device::new).collect();
         let share = config.share.rule();
         let rng = SmallRng::seed_from_u64(config.seed);
+        let cached = large(&config.cached);
         Self {
             config,
             session: Session::Offline,
@@ -263,7 +274,8 @@ impl WorkerMachine {
             contents: BTreeMap::new(),
             refetch_at: None,
             located_by: None,
-            cached: BTreeSet::new(),
+            cached,
+            cache: CacheFigures::default(),
             devices,
             lags: Lags::default(),
             share,
@@ -287,6 +299,7 @@ impl WorkerMachine {
             Event::AppLinkClosed { link } => self.app_link_closed(now, link),
             Event::ContentReady(content) => self.content_ready(content),
             Event::ContentEvicted(content) => self.content_evicted(content),
+            Event::CacheCounted(figures) => self.cache = figures,
             Event::ContentFailed { content, reason } => self.content_failed(now, content, &reason),
             Event::Started { job, device } | Event::Resumed { job, device } => self.started(now, job, device),
             Event::Yielded { job, device } => self.yielded(now, job, device),

@@ -86,6 +86,7 @@ impl WorkerMachine {
             CoordinatorToNode::Cancel { jobs } => jobs.into_iter().for_each(|job| self.cancel(job)),
             CoordinatorToNode::Retract { steal, jobs } => self.retract(steal, &jobs),
             CoordinatorToNode::Located { content, peer } => self.located(content, peer),
+            CoordinatorToNode::Evict { contents } => self.push(Effect::Evict(contents)),
             CoordinatorToNode::Drain => self.start_drain(now),
             CoordinatorToNode::HeartbeatAck { sequence } => self.reports.confirm(sequence),
         }
@@ -103,6 +104,7 @@ impl WorkerMachine {
             sequence: self.heartbeat_sequence,
             devices,
             spool_bytes: self.spool_bytes,
+            cache: self.cache,
         });
         self.reports.heartbeat_said(self.heartbeat_sequence);
     }

@@ -13,9 +13,9 @@ use farm_core::{
         TaskId,
     },
     message::{
-        AppHello, AppToCoordinator, Contact, CoordinatorToApp, CoordinatorToNode, CostNs, DeviceLoad,
-        Executed, JobFailure, JobTrace, NodeHello, NodeToCoordinator, PROTOCOL_VERSION, Plan, PlanJob,
-        PlanRequest, RunningJob,
+        AppHello, AppToCoordinator, CacheFigures, Contact, CoordinatorToApp, CoordinatorToNode, CostNs,
+        DeviceLoad, Executed, JobFailure, JobTrace, NodeHello, NodeToCoordinator, PROTOCOL_VERSION, Plan,
+        PlanJob, PlanRequest, RunningJob,
     },
     program::Content,
     time::Instant,
@@ -165,7 +165,12 @@ impl Farm {
     ) -> BTreeMap<u64, Vec<JobAttempt>> {
         let running = running.map(|(job, for_ns)| RunningJob { job, for_ns });
         let devices = vec![DeviceLoad { queued_jobs: 0, running }];
-        let message = NodeToCoordinator::Heartbeat { sequence: 1, devices, spool_bytes: 0 };
+        let message = NodeToCoordinator::Heartbeat {
+            sequence: 1,
+            devices,
+            spool_bytes: 0,
+            cache: CacheFigures::default(),
+        };
         self.handle(Event::FromNode { link: LinkId(node), message })
     }
 

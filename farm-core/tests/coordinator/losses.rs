@@ -18,8 +18,9 @@ fn the_jobs_of_a_lost_device_are_booked_on_its_sibling() {
     let lost = NodeToCoordinator::DeviceLost { device: DeviceIndex(0), reason: "test".to_owned() };
     farm.handle(Event::FromNode { link: LinkId(1), message: lost });
     let node = &farm.machine.status().nodes[0];
-    let planned: Vec<u64> = node.devices.iter().map(|device| device.planned_jobs).collect();
-    assert_eq!(planned, [8], "thieves see all that the one device has to do");
+    let devices: Vec<(bool, u64)> =
+        node.devices.iter().map(|device| (device.lost, device.planned_jobs)).collect();
+    assert_eq!(devices, [(true, 0), (false, 8)], "thieves see all that the one device has to do");
 }
 
 /// Fails the job for want of its contents wherever it goes, for so long; gives where it is then.

@@ -17,7 +17,7 @@ impl Farm {
     }
 
     fn has(&mut self, node: u64) -> Vec<(u64, Option<String>)> {
-        self.node_says(node, NodeToCoordinator::CacheChanged { held: vec![LARGE.hash], gone: Vec::new() })
+        self.node_says(node, NodeToCoordinator::CacheChanged { held: vec![LARGE], gone: Vec::new() })
     }
 
     fn lost_it(&mut self, node: u64) -> Vec<(u64, Option<String>)> {

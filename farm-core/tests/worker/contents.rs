@@ -37,7 +37,7 @@ fn told_of_cache(node: &mut Node) -> Vec<NodeToCoordinator> {
 }
 
 fn held() -> NodeToCoordinator {
-    NodeToCoordinator::CacheChanged { held: vec![LARGE.hash], gone: Vec::new() }
+    NodeToCoordinator::CacheChanged { held: vec![LARGE], gone: Vec::new() }
 }
 
 fn gone() -> NodeToCoordinator {

@@ -48,6 +48,7 @@ impl Node {
             spool_quota_bytes: 1_000,
             local_stealing,
             share: Share::DEFAULT,
+            cached: Vec::new(),
             seed: 1,
         });
         let mut node = Self {

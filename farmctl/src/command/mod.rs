@@ -1,6 +1,7 @@
 //! One file per verb: checked arguments in, work done through the libraries, a `Failure` or nothing out.
 
 pub(crate) mod alignment;
+pub(crate) mod cache;
 pub(crate) mod membership;
 pub(crate) mod mi;
 pub(crate) mod node;

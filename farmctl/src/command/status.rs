@@ -44,6 +44,7 @@ fn screen(status: &FarmStatus, wide: bool) -> String {
 
 fn headline(status: &FarmStatus) -> String {
     let devices: Vec<&DeviceStatus> = status.nodes.iter().flat_map(|node| &node.devices).collect();
+    let lost = devices.iter().filter(|device| device.lost).count();
     let busy = devices.iter().filter(|device| device.running_jobs > 0).count();
     let mut by_state: BTreeMap<&str, usize> = BTreeMap::new();
     for node in &status.nodes {
@@ -64,9 +65,10 @@ fn headline(status: &FarmStatus) -> String {
         (0, 0, _) => "IDLE",
     };
     format!(
-        "{word}  nodes: {nodes}  devices: {busy} of {} busy  jobs: {outstanding} placed, {waiting} waiting, {} delivered, \
+        "{word}  nodes: {nodes}  devices: {busy} of {} busy{}  jobs: {outstanding} placed, {waiting} waiting, {} delivered, \
          {} stolen, {} replanned  (coordinator {})\n",
-        devices.len(),
+        devices.len() - lost,
+        if lost == 0 { String::new() } else { format!(", {lost} LOST") },
         status.delivered_jobs,
         status.stolen_jobs,
         status.replanned_jobs,
@@ -87,7 +89,7 @@ fn nodes_table(nodes: &[NodeStatus], wide: bool) -> String {
             let mut row = vec![
                 node.node.to_string(),
                 printable(&node.name),
-                state_word(node.state).to_owned(),
+                if device.lost { "lost" } else { state_word(node.state) }.to_owned(),
                 format!("{} {}", device.device.0, printable(&device.name)),
                 device.kind.to_string(),
                 format!("{:.0}", device.score),
@@ -140,6 +142,7 @@ mod tests {
     use farm_core::{
         device::DeviceKind,
         id::{AppId, DeviceIndex, Epoch, NodeId},
+        message::CacheFigures,
     };
 
     use super::*;
@@ -154,6 +157,7 @@ mod tests {
             running_jobs: 1,
             executed_jobs: 7,
             device_time_ns: 1_500_000_000,
+            lost: false,
         };
         let node = NodeStatus {
             node: NodeId(1),
@@ -161,6 +165,7 @@ mod tests {
             state: NodeState::Alive,
             addresses: vec!["127.0.0.1:7800".to_owned()],
             devices: vec![device],
+            cache: CacheFigures::default(),
         };
         let app = AppStatus {
             app: AppId(3),
@@ -192,6 +197,16 @@ mod tests {
         }
         assert!(!text.contains("7800"), "addresses are for `-o wide`");
         assert!(screen(&farm(), true).contains("7800"), "`-o wide` shows addresses");
+    }
+
+    #[test]
+    fn a_lost_device_is_shown_as_lost() {
+        let mut status = farm();
+        let mut lost = status.nodes[0].devices[0].clone();
+        (lost.lost, lost.running_jobs) = (true, 0);
+        status.nodes[0].devices.push(lost);
+        let text = screen(&status, false);
+        assert!(text.contains("1 of 1 busy, 1 LOST") && text.contains(" lost "), "{text}");
     }
 
     #[test]

@@ -28,12 +28,12 @@ pub mod v1;
 pub use self::{
     convert::{
         MAX_ADDRESSES, MAX_CERTIFICATE_BYTES, MAX_CONTENTS, MAX_ENTRIES, MAX_JOBS, MAX_NAME_BYTES,
-        MAX_TEXT_BYTES, WireError,
+        MAX_TEXT_BYTES, WireError, eviction,
     },
     incoming::Incoming,
     session::{
         CAPABILITY_METADATA, Heard, QUEUED_MESSAGES, Session, SessionError, SessionReceiver, SessionSender,
-        connect_app, connect_node, drain, status, timeline,
+        connect_app, connect_node, contents, drain, evict, status, timeline,
     },
     stream::{Caller, ControlStream},
     transport::{

@@ -4,10 +4,10 @@ use std::fmt;
 
 use farm_core::{
     coordinator::{
-        FarmStatus,
+        ContentsStatus, FarmStatus,
         timeline::{MAX_SEGMENTS, Segment, Timeline, TimelineQuery},
     },
-    id::NodeId,
+    id::{ContentHash, NodeId},
     message::{AppToCoordinator, CoordinatorToApp, CoordinatorToNode, NodeToCoordinator},
 };
 use thiserror::Error;
@@ -217,6 +217,36 @@ pub async fn status(coordinator: &str, identity: Option<&Identity>) -> Result<Fa
 pub async fn drain(coordinator: &str, identity: Option<&Identity>, node: NodeId) -> Result<(), SessionError> {
     let mut client = admin(coordinator, identity).await?;
     within_timeout(coordinator, client.drain(Request::new(v1::DrainRequest { node: node.0 }))).await?;
+    Ok(())
+}
+
+/// Asks what large contents the caches of nodes hold.
+///
+/// # Errors
+/// Nobody answers.
+pub async fn contents(
+    coordinator: &str,
+    identity: Option<&Identity>,
+) -> Result<ContentsStatus, SessionError> {
+    let mut client = admin(coordinator, identity).await?;
+    let answer = within_timeout(coordinator, client.contents(Request::new(v1::ContentsRequest {}))).await?;
+    Ok(answer.into_inner().try_into()?)
+}
+
+/// Has nodes drop contents that no job needs: one node or all, these contents or all.
+///
+/// # Errors
+/// Nobody answers, or the node is unknown.
+pub async fn evict(
+    coordinator: &str,
+    identity: Option<&Identity>,
+    node: Option<NodeId>,
+    contents: &[ContentHash],
+) -> Result<(), SessionError> {
+    let mut client = admin(coordinator, identity).await?;
+    let contents = contents.iter().map(|hash| hash.0.into()).collect();
+    let request = v1::EvictRequest { node: node.map(|node| node.0), contents };
+    within_timeout(coordinator, client.evict(Request::new(request))).await?;
     Ok(())
 }
 

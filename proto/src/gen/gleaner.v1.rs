@@ -189,6 +189,40 @@ pub mod job_failure {
 /// A case that says all by being there.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct Nothing {}
+/// A node's cache of task allocations and modules; counts are since the node started.
+#[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct CacheFigures {
+    /// Contents in memory.
+    #[prost(uint64, tag = "1")]
+    pub memory_contents: u64,
+    /// Their bytes.
+    #[prost(uint64, tag = "2")]
+    pub memory_bytes: u64,
+    /// Contents on disk, those in memory too.
+    #[prost(uint64, tag = "3")]
+    pub disk_contents: u64,
+    /// Their bytes.
+    #[prost(uint64, tag = "4")]
+    pub disk_bytes: u64,
+    /// Contents that jobs needed and that were in memory.
+    #[prost(uint64, tag = "5")]
+    pub memory_hits: u64,
+    /// Contents that jobs needed and that were on disk.
+    #[prost(uint64, tag = "6")]
+    pub disk_hits: u64,
+    /// Contents that were fetched from elsewhere.
+    #[prost(uint64, tag = "7")]
+    pub fetches: u64,
+    /// Their bytes.
+    #[prost(uint64, tag = "8")]
+    pub fetched_bytes: u64,
+    /// Contents that went from memory to make room.
+    #[prost(uint64, tag = "9")]
+    pub memory_evictions: u64,
+    /// Contents that went from the disk to make room.
+    #[prost(uint64, tag = "10")]
+    pub disk_evictions: u64,
+}
 /// Answered by a HeartbeatAck of the same sequence.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct HeartbeatAck {
@@ -280,6 +314,9 @@ pub struct DeviceStatus {
     /// Device time of these, in nanoseconds.
     #[prost(uint64, tag = "8")]
     pub device_time_ns: u64,
+    /// Gone: it gets no jobs until its node starts anew.
+    #[prost(bool, tag = "9")]
+    pub lost: bool,
 }
 /// A node.
 #[derive(Clone, PartialEq, ::prost::Message)]
@@ -299,6 +336,9 @@ pub struct NodeStatus {
     /// Its devices.
     #[prost(message, repeated, tag = "5")]
     pub devices: ::prost::alloc::vec::Vec<DeviceStatus>,
+    /// Its cache, by the last heartbeat.
+    #[prost(message, optional, tag = "6")]
+    pub cache: ::core::option::Option<CacheFigures>,
 }
 /// An application.
 #[derive(Clone, PartialEq, ::prost::Message)]
@@ -356,6 +396,42 @@ pub struct FarmStatus {
     #[prost(uint64, tag = "8")]
     pub policy_fallbacks: u64,
 }
+/// Asks what large contents the caches of nodes hold.
+#[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct ContentsRequest {}
+/// A content of 1 MiB or more.
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct ContentStatus {
+    /// Which, and how large.
+    #[prost(message, optional, tag = "1")]
+    pub content: ::core::option::Option<Content>,
+    /// Where it is, by id.
+    #[prost(uint64, repeated, tag = "2")]
+    pub nodes: ::prost::alloc::vec::Vec<u64>,
+}
+/// The large contents in the caches of nodes.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct ContentsStatus {
+    /// The largest first, at most 4,096.
+    #[prost(message, repeated, tag = "1")]
+    pub contents: ::prost::alloc::vec::Vec<ContentStatus>,
+    /// How many more there are.
+    #[prost(uint64, tag = "2")]
+    pub omitted: u64,
+}
+/// Asks nodes to drop contents that no job needs.
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct EvictRequest {
+    /// One node; absent for all.
+    #[prost(uint64, optional, tag = "1")]
+    pub node: ::core::option::Option<u64>,
+    /// blake3 of each, 32 B; all contents if none is named.
+    #[prost(bytes = "vec", repeated, tag = "2")]
+    pub contents: ::prost::alloc::vec::Vec<::prost::alloc::vec::Vec<u8>>,
+}
+/// The nodes were asked.
+#[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct EvictResponse {}
 /// Asks what ran when and where.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct TimelineRequest {
@@ -662,6 +738,46 @@ pub mod admin_client {
             req.extensions_mut().insert(GrpcMethod::new("gleaner.v1.Admin", "Timeline"));
             self.inner.server_streaming(req, path, codec).await
         }
+        /// The large contents in the caches of nodes.
+        pub async fn contents(
+            &mut self,
+            request: impl tonic::IntoRequest<super::ContentsRequest>,
+        ) -> std::result::Result<tonic::Response<super::ContentsStatus>, tonic::Status> {
+            self.inner
+                .ready()
+                .await
+                .map_err(|e| {
+                    tonic::Status::unknown(
+                        format!("Service was not ready: {}", e.into()),
+                    )
+                })?;
+            let codec = tonic_prost::ProstCodec::default();
+            let path = http::uri::PathAndQuery::from_static(
+                "/gleaner.v1.Admin/Contents",
+            );
+            let mut req = request.into_request();
+            req.extensions_mut().insert(GrpcMethod::new("gleaner.v1.Admin", "Contents"));
+            self.inner.unary(req, path, codec).await
+        }
+        /// Has nodes drop contents that no job needs. NOT_FOUND if the node named is not there.
+        pub async fn evict(
+            &mut self,
+            request: impl tonic::IntoRequest<super::EvictRequest>,
+        ) -> std::result::Result<tonic::Response<super::EvictResponse>, tonic::Status> {
+            self.inner
+                .ready()
+                .await
+                .map_err(|e| {
+                    tonic::Status::unknown(
+                        format!("Service was not ready: {}", e.into()),
+                    )
+                })?;
+            let codec = tonic_prost::ProstCodec::default();
+            let path = http::uri::PathAndQuery::from_static("/gleaner.v1.Admin/Evict");
+            let mut req = request.into_request();
+            req.extensions_mut().insert(GrpcMethod::new("gleaner.v1.Admin", "Evict"));
+            self.inner.unary(req, path, codec).await
+        }
     }
 }
 /// Generated server implementations.
@@ -698,6 +814,16 @@ pub mod admin_server {
             &self,
             request: tonic::Request<super::TimelineRequest>,
         ) -> std::result::Result<tonic::Response<Self::TimelineStream>, tonic::Status>;
+        /// The large contents in the caches of nodes.
+        async fn contents(
+            &self,
+            request: tonic::Request<super::ContentsRequest>,
+        ) -> std::result::Result<tonic::Response<super::ContentsStatus>, tonic::Status>;
+        /// Has nodes drop contents that no job needs. NOT_FOUND if the node named is not there.
+        async fn evict(
+            &self,
+            request: tonic::Request<super::EvictRequest>,
+        ) -> std::result::Result<tonic::Response<super::EvictResponse>, tonic::Status>;
     }
     /// What operators call.
     #[derive(Debug)]
@@ -904,6 +1030,92 @@ pub mod admin_server {
                                 max_encoding_message_size,
                             );
                         let res = grpc.server_streaming(method, req).await;
+                        Ok(res)
+                    };
+                    Box::pin(fut)
+                }
+                "/gleaner.v1.Admin/Contents" => {
+                    #[allow(non_camel_case_types)]
+                    struct ContentsSvc<T: Admin>(pub Arc<T>);
+                    impl<T: Admin> tonic::server::UnaryService<super::ContentsRequest>
+                    for ContentsSvc<T> {
+                        type Response = super::ContentsStatus;
+                        type Future = BoxFuture<
+                            tonic::Response<Self::Response>,
+                            tonic::Status,
+                        >;
+                        fn call(
+                            &mut self,
+                            request: tonic::Request<super::ContentsRequest>,
+                        ) -> Self::Future {
+                            let inner = Arc::clone(&self.0);
+                            let fut = async move {
+                                <T as Admin>::contents(&inner, request).await
+                            };
+                            Box::pin(fut)
+                        }
+                    }
+                    let accept_compression_encodings = self.accept_compression_encodings;
+                    let send_compression_encodings = self.send_compression_encodings;
+                    let max_decoding_message_size = self.max_decoding_message_size;
+                    let max_encoding_message_size = self.max_encoding_message_size;
+                    let inner = self.inner.clone();
+                    let fut = async move {
+                        let method = ContentsSvc(inner);
+                        let codec = tonic_prost::ProstCodec::default();
+                        let mut grpc = tonic::server::Grpc::new(codec)
+                            .apply_compression_config(
+                                accept_compression_encodings,
+                                send_compression_encodings,
+                            )
+                            .apply_max_message_size_config(
+                                max_decoding_message_size,
+                                max_encoding_message_size,
+                            );
+                        let res = grpc.unary(method, req).await;
+                        Ok(res)
+                    };
+                    Box::pin(fut)
+                }
+                "/gleaner.v1.Admin/Evict" => {
+                    #[allow(non_camel_case_types)]
+                    struct EvictSvc<T: Admin>(pub Arc<T>);
+                    impl<T: Admin> tonic::server::UnaryService<super::EvictRequest>
+                    for EvictSvc<T> {
+                        type Response = super::EvictResponse;
+                        type Future = BoxFuture<
+                            tonic::Response<Self::Response>,
+                            tonic::Status,
+                        >;
+                        fn call(
+                            &mut self,
+                            request: tonic::Request<super::EvictRequest>,
+                        ) -> Self::Future {
+                            let inner = Arc::clone(&self.0);
+                            let fut = async move {
+                                <T as Admin>::evict(&inner, request).await
+                            };
+                            Box::pin(fut)
+                        }
+                    }
+                    let accept_compression_encodings = self.accept_compression_encodings;
+                    let send_compression_encodings = self.send_compression_encodings;
+                    let max_decoding_message_size = self.max_decoding_message_size;
+                    let max_encoding_message_size = self.max_encoding_message_size;
+                    let inner = self.inner.clone();
+                    let fut = async move {
+                        let method = EvictSvc(inner);
+                        let codec = tonic_prost::ProstCodec::default();
+                        let mut grpc = tonic::server::Grpc::new(codec)
+                            .apply_compression_config(
+                                accept_compression_encodings,
+                                send_compression_encodings,
+                            )
+                            .apply_max_message_size_config(
+                                max_decoding_message_size,
+                                max_encoding_message_size,
+                            );
+                        let res = grpc.unary(method, req).await;
                         Ok(res)
                     };
                     Box::pin(fut)
@@ -1599,6 +1811,9 @@ pub struct NodeHeartbeat {
     /// Executed results not yet acknowledged, in bytes.
     #[prost(uint64, tag = "3")]
     pub spool_bytes: u64,
+    /// How the node's cache of contents stands.
+    #[prost(message, optional, tag = "4")]
+    pub cache: ::core::option::Option<CacheFigures>,
 }
 /// How one device stands.
 #[derive(Clone, PartialEq, ::prost::Message)]
@@ -1689,6 +1904,9 @@ pub struct CacheChanged {
     /// blake3 of each that cannot, 32 B.
     #[prost(bytes = "vec", repeated, tag = "2")]
     pub gone: ::prost::alloc::vec::Vec<::prost::alloc::vec::Vec<u8>>,
+    /// The size of each of `held`, in bytes.
+    #[prost(uint64, repeated, tag = "3")]
+    pub held_size_bytes: ::prost::alloc::vec::Vec<u64>,
 }
 /// A device is gone.
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
@@ -1704,7 +1922,10 @@ pub struct DeviceLost {
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct CoordinatorToNode {
     /// One of these.
-    #[prost(oneof = "coordinator_to_node::Message", tags = "1, 2, 3, 4, 5, 6, 7, 8, 9")]
+    #[prost(
+        oneof = "coordinator_to_node::Message",
+        tags = "1, 2, 3, 4, 5, 6, 7, 8, 9, 10"
+    )]
     pub message: ::core::option::Option<coordinator_to_node::Message>,
 }
 /// Nested message and enum types in `CoordinatorToNode`.
@@ -1739,6 +1960,9 @@ pub mod coordinator_to_node {
         /// Where to fetch a content.
         #[prost(message, tag = "9")]
         Located(super::Located),
+        /// Drop contents that no job needs.
+        #[prost(message, tag = "10")]
+        Evict(super::Evict),
     }
 }
 /// Registered.
@@ -1783,6 +2007,13 @@ pub struct Located {
     /// A node that has it; unset: from the application.
     #[prost(message, optional, tag = "2")]
     pub peer: ::core::option::Option<Contact>,
+}
+/// Drop these contents, in memory and on disk, where no job needs them.
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct Evict {
+    /// blake3 of each, 32 B; all such contents if none is named.
+    #[prost(bytes = "vec", repeated, tag = "1")]
+    pub contents: ::prost::alloc::vec::Vec<::prost::alloc::vec::Vec<u8>>,
 }
 /// Everything of an application can be freed.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]

@@ -70,15 +70,25 @@ pub struct Link<S, R> {
     pub receiver: LinkReceiver<R>,
 }
 
-/// Answers the other side's content fetches: the bytes of a digest, or `None` if they are not here. Called on a network
-/// task: it looks up, it does not compute or block.
+/// Answers the other side's content fetches: the bytes of a digest, or `None` if they are not here.
 #[derive(Clone)]
-pub struct ContentSource(Arc<dyn Fn(ContentHash) -> Option<Bytes> + Send + Sync>);
+pub struct ContentSource {
+    at_hand: Lookup,
+    stored: Option<Lookup>,
+}
+
+type Lookup = Arc<dyn Fn(ContentHash) -> Option<Bytes> + Send + Sync>;
 
 impl ContentSource {
-    /// A source that asks `lookup`.
+    /// A source that asks `lookup`. Called on a network task: it looks up, it does not compute or block.
     pub fn new(lookup: impl Fn(ContentHash) -> Option<Bytes> + Send + Sync + 'static) -> Self {
-        Self(Arc::new(lookup))
+        Self { at_hand: Arc::new(lookup), stored: None }
+    }
+
+    /// Where that has nothing, `lookup` is asked, which may block: it is called on a thread for that.
+    #[must_use]
+    pub fn or_stored(self, lookup: impl Fn(ContentHash) -> Option<Bytes> + Send + Sync + 'static) -> Self {
+        Self { stored: Some(Arc::new(lookup)), ..self }
     }
 
     /// A source that has nothing.
@@ -87,8 +97,13 @@ impl ContentSource {
         Self::new(|_| None)
     }
 
-    fn get(&self, hash: ContentHash) -> Option<Bytes> {
-        (self.0)(hash)
+    async fn get(&self, hash: ContentHash) -> Option<Bytes> {
+        if let Some(bytes) = (self.at_hand)(hash) {
+            return Some(bytes);
+        }
+        let stored = Arc::clone(self.stored.as_ref()?);
+        // A runtime that ends answers nothing any more.
+        tokio::task::spawn_blocking(move || stored(hash)).await.ok().flatten()
     }
 }
 

@@ -23,7 +23,7 @@ use super::{
     wire::{FromExecutor, ToExecutor},
 };
 use crate::{
-    content::Shelf,
+    contents::Shelf,
     device::{DeviceEvent, DeviceNews, Payload},
 };
 

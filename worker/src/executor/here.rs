@@ -14,7 +14,7 @@ use tokio::sync::mpsc;
 
 use super::Order;
 use crate::{
-    content::Shelf,
+    contents::Shelf,
     device::{DeviceEvent, DeviceNews},
 };
 

@@ -23,7 +23,7 @@ use self::{
     apart::{ExecutorProcess, Launch},
     here::InProcess,
 };
-use crate::{StartError, content::Shelf, device::DeviceEvent};
+use crate::{StartError, contents::Shelf, device::DeviceEvent};
 
 /// First argument of a binary that is to be an executor process; the second is its device.
 const ROLE: &str = "executor";

@@ -1,14 +1,18 @@
 //! Operators and the coordinator.
 
 use farm_core::{
-    coordinator::{AppStatus, DeviceStatus, FarmStatus, NodeState, NodeStatus},
-    id::{AppId, Epoch, NodeId},
+    coordinator::{
+        AppStatus, ContentStatus, ContentsStatus, DeviceStatus, FarmStatus, NodeState, NodeStatus,
+    },
+    id::{AppId, ContentHash, Epoch, NodeId},
 };
 
 use super::{
-    MAX_ENTRIES, WireError, device, enumeration, list,
+    MAX_CONTENTS, MAX_ENTRIES, WireError, device, enumeration, list,
     model::{addresses, device_kind},
-    name, score, weight,
+    name,
+    nodes::hashes,
+    required, score, weight, within,
 };
 use crate::control::v1;
 
@@ -57,6 +61,7 @@ impl From<NodeStatus> for v1::NodeStatus {
             state: state.into(),
             addresses: node.addresses,
             devices: node.devices.into_iter().map(Into::into).collect(),
+            cache: Some(node.cache.into()),
         }
     }
 }
@@ -77,6 +82,7 @@ impl TryFrom<v1::NodeStatus> for NodeStatus {
             },
             addresses: addresses("NodeStatus.addresses", wire.addresses)?,
             devices: list("NodeStatus.devices", MAX_ENTRIES, wire.devices)?,
+            cache: wire.cache.map(Into::into).unwrap_or_default(),
         })
     }
 }
@@ -92,6 +98,7 @@ impl From<DeviceStatus> for v1::DeviceStatus {
             running_jobs: device.running_jobs,
             executed_jobs: device.executed_jobs,
             device_time_ns: device.device_time_ns,
+            lost: device.lost,
         }
     }
 }
@@ -109,6 +116,7 @@ impl TryFrom<v1::DeviceStatus> for DeviceStatus {
             running_jobs: wire.running_jobs,
             executed_jobs: wire.executed_jobs,
             device_time_ns: wire.device_time_ns,
+            lost: wire.lost,
         })
     }
 }
@@ -143,4 +151,43 @@ impl TryFrom<v1::AppStatus> for AppStatus {
             device_time_ns: wire.device_time_ns,
         })
     }
+}
+
+impl From<ContentsStatus> for v1::ContentsStatus {
+    fn from(status: ContentsStatus) -> Self {
+        let contents = status.contents.into_iter().map(|held| v1::ContentStatus {
+            content: Some(held.content.into()),
+            nodes: held.nodes.into_iter().map(|node| node.0).collect(),
+        });
+        Self { contents: contents.collect(), omitted: status.omitted }
+    }
+}
+
+impl TryFrom<v1::ContentsStatus> for ContentsStatus {
+    type Error = WireError;
+
+    fn try_from(wire: v1::ContentsStatus) -> Result<Self, WireError> {
+        let contents = list("ContentsStatus.contents", MAX_CONTENTS, wire.contents)?;
+        Ok(Self { contents, omitted: wire.omitted })
+    }
+}
+
+impl TryFrom<v1::ContentStatus> for ContentStatus {
+    type Error = WireError;
+
+    fn try_from(wire: v1::ContentStatus) -> Result<Self, WireError> {
+        within("ContentStatus.nodes", wire.nodes.len(), MAX_ENTRIES)?;
+        Ok(Self {
+            content: required("ContentStatus.content", wire.content)?.try_into()?,
+            nodes: wire.nodes.into_iter().map(NodeId).collect(),
+        })
+    }
+}
+
+/// What an eviction asks for: of one node or all, these contents or all.
+///
+/// # Errors
+/// It names too many contents, or something that is no digest.
+pub fn eviction(wire: v1::EvictRequest) -> Result<(Option<NodeId>, Vec<ContentHash>), WireError> {
+    Ok((wire.node.map(NodeId), hashes("EvictRequest.contents", &wire.contents)?))
 }

@@ -8,6 +8,7 @@ mod model;
 mod nodes;
 mod timeline;
 
+pub use self::admin::eviction;
 use farm_core::id::DeviceIndex;
 use thiserror::Error;
 

@@ -3,7 +3,7 @@
 use farm_core::{
     device::{DeviceInfo, DeviceKind, Features, Limits, Requirements, SimulatedDevices},
     id::{AppId, ContentHash, JobId, JobIndex, TaskId},
-    message::{Contact, JobFailure, Liveness},
+    message::{CacheFigures, Contact, JobFailure, Liveness},
     program::Content,
 };
 
@@ -218,5 +218,39 @@ impl TryFrom<v1::JobFailure> for JobFailure {
             Cause::Cancelled(v1::Nothing {}) => Self::Cancelled,
             Cause::Returned(v1::Nothing {}) => Self::Returned,
         })
+    }
+}
+
+impl From<CacheFigures> for v1::CacheFigures {
+    fn from(figures: CacheFigures) -> Self {
+        Self {
+            memory_contents: figures.memory_contents,
+            memory_bytes: figures.memory_bytes,
+            disk_contents: figures.disk_contents,
+            disk_bytes: figures.disk_bytes,
+            memory_hits: figures.memory_hits,
+            disk_hits: figures.disk_hits,
+            fetches: figures.fetches,
+            fetched_bytes: figures.fetched_bytes,
+            memory_evictions: figures.memory_evictions,
+            disk_evictions: figures.disk_evictions,
+        }
+    }
+}
+
+impl From<v1::CacheFigures> for CacheFigures {
+    fn from(wire: v1::CacheFigures) -> Self {
+        Self {
+            memory_contents: wire.memory_contents,
+            memory_bytes: wire.memory_bytes,
+            disk_contents: wire.disk_contents,
+            disk_bytes: wire.disk_bytes,
+            memory_hits: wire.memory_hits,
+            disk_hits: wire.disk_hits,
+            fetches: wire.fetches,
+            fetched_bytes: wire.fetched_bytes,
+            memory_evictions: wire.memory_evictions,
+            disk_evictions: wire.disk_evictions,
+        }
     }
 }

@@ -6,6 +6,7 @@ use farm_core::{
         CoordinatorToNode, DeviceLoad, Executed, JobFailure, JobTrace, NodeHello, NodeToCoordinator,
         RunningJob,
     },
+    program::Content,
     time::Instant,
 };
 
@@ -20,9 +21,10 @@ impl From<NodeToCoordinator> for v1::NodeToCoordinator {
         use v1::node_to_coordinator::Message;
         let message = match message {
             NodeToCoordinator::Hello(hello) => Message::Hello(hello.into()),
-            NodeToCoordinator::Heartbeat { sequence, devices, spool_bytes } => {
+            NodeToCoordinator::Heartbeat { sequence, devices, spool_bytes, cache } => {
                 let devices = devices.into_iter().map(Into::into).collect();
-                Message::Heartbeat(v1::NodeHeartbeat { sequence, devices, spool_bytes })
+                let cache = Some(cache.into());
+                Message::Heartbeat(v1::NodeHeartbeat { sequence, devices, spool_bytes, cache })
             }
             NodeToCoordinator::Report { sent_at, executed, delivered } => {
                 Message::Report(report(sent_at, executed, &delivered))
@@ -39,11 +41,11 @@ impl From<NodeToCoordinator> for v1::NodeToCoordinator {
                 })
             }
             NodeToCoordinator::Locate(content) => Message::Locate(content.into()),
-            NodeToCoordinator::CacheChanged { held, gone } => {
-                let [held, gone] =
-                    [held, gone].map(|list| list.into_iter().map(|hash| hash.0.into()).collect());
-                Message::CacheChanged(v1::CacheChanged { held, gone })
-            }
+            NodeToCoordinator::CacheChanged { held, gone } => Message::CacheChanged(v1::CacheChanged {
+                held_size_bytes: held.iter().map(|content| content.size_bytes).collect(),
+                held: held.into_iter().map(|content| content.hash.0.into()).collect(),
+                gone: gone.into_iter().map(|hash| hash.0.into()).collect(),
+            }),
             NodeToCoordinator::Goodbye => Message::Goodbye(v1::Nothing {}),
         };
         Self { message: Some(message) }
@@ -67,6 +69,8 @@ impl TryFrom<v1::NodeToCoordinator> for NodeToCoordinator {
                         .map(TryInto::try_into)
                         .collect::<Result<_, WireError>>()?,
                     spool_bytes: heartbeat.spool_bytes,
+                    // A node of before this field.
+                    cache: heartbeat.cache.map(Into::into).unwrap_or_default(),
                 }
             }
             Message::Report(report) => {
@@ -85,10 +89,9 @@ impl TryFrom<v1::NodeToCoordinator> for NodeToCoordinator {
                 unknown: required("Retracted.unknown", answer.unknown)?.try_into()?,
             },
             Message::Locate(content) => Self::Locate(content.try_into()?),
-            Message::CacheChanged(change) => Self::CacheChanged {
-                held: contents("CacheChanged.held", &change.held)?,
-                gone: contents("CacheChanged.gone", &change.gone)?,
-            },
+            Message::CacheChanged(change) => {
+                Self::CacheChanged { held: held(&change)?, gone: hashes("CacheChanged.gone", &change.gone)? }
+            }
             Message::Goodbye(v1::Nothing {}) => Self::Goodbye,
         })
     }
@@ -226,7 +229,19 @@ fn executed(wire: v1::Report) -> Result<Vec<Executed>, WireError> {
     }
 }
 
-fn contents(field: &'static str, wire: &[Vec<u8>]) -> Result<Vec<ContentHash>, WireError> {
+/// What a cache holds now. A node of before the sizes does not say them.
+fn held(change: &v1::CacheChanged) -> Result<Vec<Content>, WireError> {
+    let hashes = hashes("CacheChanged.held", &change.held)?;
+    let sizes = &change.held_size_bytes;
+    if !(sizes.is_empty() || sizes.len() == hashes.len()) {
+        let found = format!("{} entries for {} contents", sizes.len(), hashes.len());
+        return Err(invalid("CacheChanged.held_size_bytes", found));
+    }
+    let sizes = sizes.iter().copied().chain(std::iter::repeat(0));
+    Ok(hashes.into_iter().zip(sizes).map(|(hash, size_bytes)| Content { hash, size_bytes }).collect())
+}
+
+pub(super) fn hashes(field: &'static str, wire: &[Vec<u8>]) -> Result<Vec<ContentHash>, WireError> {
     within(field, wire.len(), MAX_CONTENTS)?;
     wire.iter().map(|bytes| content_hash(field, bytes)).collect()
 }
@@ -256,6 +271,9 @@ impl From<CoordinatorToNode> for v1::CoordinatorToNode {
             CoordinatorToNode::Located { content, peer } => {
                 Message::Located(v1::Located { content: content.0.into(), peer: peer.map(Into::into) })
             }
+            CoordinatorToNode::Evict { contents } => Message::Evict(v1::Evict {
+                contents: contents.into_iter().map(|hash| hash.0.into()).collect(),
+            }),
             CoordinatorToNode::Drain => Message::Drain(v1::Nothing {}),
             CoordinatorToNode::HeartbeatAck { sequence } => {
                 Message::HeartbeatAck(v1::HeartbeatAck { sequence })
@@ -290,6 +308,7 @@ impl TryFrom<v1::CoordinatorToNode> for CoordinatorToNode {
                 content: content_hash("Located.content", &located.content)?,
                 peer: located.peer.map(TryInto::try_into).transpose()?,
             },
+            Message::Evict(evict) => Self::Evict { contents: hashes("Evict.contents", &evict.contents)? },
             Message::Drain(v1::Nothing {}) => Self::Drain,
             Message::HeartbeatAck(v1::HeartbeatAck { sequence }) => Self::HeartbeatAck { sequence },
         })

@@ -149,6 +149,7 @@ impl WorkerHost {
             spool_quota_bytes: 1 << 30,
             share: Share::DEFAULT,
             local_stealing: true,
+            cached: Vec::new(),
             seed,
         }));
     }
@@ -308,6 +309,7 @@ impl World {
                     self.after(Duration::ZERO, Happening::Worker { worker: index, life, event });
                 }
             }
+            Effect::Evict(_) => unreachable!("no operator asks for it here"),
             Effect::Exit => self.exit_worker(index),
         }
     }

@@ -19,7 +19,7 @@ pub(crate) struct Shelf {
 }
 
 impl Shelf {
-    /// The bytes of a content that is here.
+    /// The bytes of a content that is in memory.
     pub(crate) fn get(&self, hash: &ContentHash) -> Option<Bytes> {
         self.bytes.read().unwrap_or_else(PoisonError::into_inner).get(hash).cloned()
     }
@@ -35,7 +35,7 @@ impl Shelf {
 
 /// The node's contents in memory.
 #[derive(Debug)]
-pub(crate) struct ContentCache {
+pub(super) struct MemoryCache {
     entries: HashMap<ContentHash, Entry>,
     shelf: Shelf,
     /// Unpinned entries by last use.
@@ -55,13 +55,13 @@ struct Entry {
 
 /// A content does not fit beside the pinned ones.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) struct CacheFull {
-    pub(crate) pinned_bytes: u64,
-    pub(crate) cap_bytes: u64,
+pub(super) struct CacheFull {
+    pub(super) pinned_bytes: u64,
+    pub(super) cap_bytes: u64,
 }
 
-impl ContentCache {
-    pub(crate) fn new(cap_bytes: u64) -> Self {
+impl MemoryCache {
+    pub(super) fn new(cap_bytes: u64) -> Self {
         Self {
             entries: HashMap::new(),
             shelf: Shelf::default(),
@@ -73,7 +73,7 @@ impl ContentCache {
     }
 
     /// Keeps a content until it is released; false if it is not here.
-    pub(crate) fn pin(&mut self, hash: ContentHash) -> bool {
+    pub(super) fn pin(&mut self, hash: ContentHash) -> bool {
         let Some(entry) = self.entries.get_mut(&hash) else { return false };
         if !std::mem::replace(&mut entry.pinned, true) {
             self.idle.remove(&entry.last_use);
@@ -82,7 +82,7 @@ impl ContentCache {
     }
 
     /// Lets a content be evicted when room is needed.
-    pub(crate) fn release(&mut self, hash: ContentHash) {
+    pub(super) fn release(&mut self, hash: ContentHash) {
         let Some(entry) = self.entries.get_mut(&hash) else { return };
         if std::mem::replace(&mut entry.pinned, false) {
             self.uses += 1;
@@ -91,13 +91,41 @@ impl ContentCache {
         }
     }
 
+    /// Drops contents that are not pinned, all such if none is named; `evicted` is told of each.
+    pub(super) fn evict(&mut self, named: &[ContentHash], mut evicted: impl FnMut(ContentHash)) {
+        let is_named = |hash: &ContentHash| named.is_empty() || named.contains(hash);
+        let idle: Vec<u64> = self.idle.iter().filter(|(_, hash)| is_named(hash)).map(|(&at, _)| at).collect();
+        for at in idle {
+            if let Some(hash) = self.idle.remove(&at) {
+                self.drop_idle(hash);
+                evicted(hash);
+            }
+        }
+    }
+
+    /// How many are here, and their bytes.
+    pub(super) fn figures(&self) -> (u64, u64) {
+        (self.entries.len() as u64, self.bytes)
+    }
+
+    pub(super) fn has(&self, hash: &ContentHash) -> bool {
+        self.entries.contains_key(hash)
+    }
+
+    fn drop_idle(&mut self, hash: ContentHash) {
+        if let Some(entry) = self.entries.remove(&hash) {
+            self.bytes -= entry.size_bytes;
+            self.shelf.take(&hash);
+        }
+    }
+
     /// Where others read.
-    pub(crate) const fn shelf(&self) -> &Shelf {
+    pub(super) const fn shelf(&self) -> &Shelf {
         &self.shelf
     }
 
     /// Takes a content in, pinned; evicts idle ones for it, which `evicted` is told of.
-    pub(crate) fn insert(
+    pub(super) fn insert(
         &mut self,
         hash: ContentHash,
         bytes: Bytes,
@@ -111,11 +139,8 @@ impl ContentCache {
             let Some((_, oldest)) = self.idle.pop_first() else {
                 return Err(CacheFull { pinned_bytes: self.bytes, cap_bytes: self.cap_bytes });
             };
-            if let Some(entry) = self.entries.remove(&oldest) {
-                self.bytes -= entry.size_bytes;
-                self.shelf.take(&oldest);
-                evicted(oldest);
-            }
+            self.drop_idle(oldest);
+            evicted(oldest);
         }
         self.bytes += size_bytes;
         self.shelf.put(hash, bytes);
@@ -134,7 +159,7 @@ mod tests {
 
     #[test]
     fn the_least_recently_used_idle_content_goes_first() {
-        let mut cache = ContentCache::new(100);
+        let mut cache = MemoryCache::new(100);
         let [(a, a_bytes), (b, b_bytes), (c, c_bytes)] = [content(1, 40), content(2, 40), content(3, 40)];
         let mut evicted = Vec::new();
         cache.insert(a, a_bytes, |hash| evicted.push(hash)).unwrap();
@@ -151,7 +176,7 @@ mod tests {
 
     #[test]
     fn pinned_contents_stay_and_the_cap_holds() {
-        let mut cache = ContentCache::new(100);
+        let mut cache = MemoryCache::new(100);
         let [(a, a_bytes), (b, b_bytes)] = [content(1, 60), content(2, 60)];
         cache.insert(a, a_bytes.clone(), drop).unwrap();
         cache.insert(a, a_bytes, drop).unwrap();

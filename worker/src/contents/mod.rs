@@ -1,0 +1,254 @@
+//! The node's task allocations and modules: in memory for jobs and for who fetches here, on disk over restarts where there
+//! is a cache folder. It owns both and the fetches on their way; where to fetch from is the machine's to say.
+
+mod disk;
+mod memory;
+
+use std::{collections::HashMap, io, path::Path};
+
+use bytes::Bytes;
+use farm_core::{id::ContentHash, message::CacheFigures, program::Content, worker::Event};
+use proto::link::ContentSource;
+use tokio::sync::mpsc;
+
+pub(crate) use self::memory::Shelf;
+use self::{
+    disk::{DiskCache, Folder},
+    memory::MemoryCache,
+};
+use crate::driver::Input;
+
+/// What is kept, and what is on its way.
+#[derive(Debug)]
+pub(crate) struct Contents {
+    memory: MemoryCache,
+    disk: Option<DiskCache>,
+    /// Fetches on the way, and whether the machine still waits for them.
+    fetching: HashMap<ContentHash, bool>,
+    figures: CacheFigures,
+    /// What the machine was told last.
+    told: CacheFigures,
+}
+
+/// What became of a fetch.
+#[derive(Debug)]
+pub(crate) struct Fetched {
+    /// The bytes, checked; or why there are none, for people.
+    result: Result<Bytes, String>,
+    /// From the disk, not from elsewhere.
+    from_disk: bool,
+    /// The disk did not have what it should.
+    disk_failed: bool,
+}
+
+impl Contents {
+    /// Opens the cache folder, if there is one. Blocks.
+    ///
+    /// # Errors
+    /// The folder cannot be used.
+    pub(crate) fn open(memory_cap_bytes: u64, disk: Option<(&Path, u64)>) -> io::Result<Self> {
+        let disk = disk.map(|(folder, cap_bytes)| DiskCache::open(folder, cap_bytes)).transpose()?;
+        Ok(Self {
+            memory: MemoryCache::new(memory_cap_bytes),
+            disk,
+            fetching: HashMap::new(),
+            figures: CacheFigures::default(),
+            told: CacheFigures::default(),
+        })
+    }
+
+    /// Where executors read what jobs on them need: all of it is in memory.
+    pub(crate) const fn shelf(&self) -> &Shelf {
+        self.memory.shelf()
+    }
+
+    /// What other nodes fetch from here.
+    pub(crate) fn source(&self) -> ContentSource {
+        let shelf = self.shelf().clone();
+        let source = ContentSource::new(move |hash| shelf.get(&hash));
+        match self.disk.as_ref().map(DiskCache::folder) {
+            Some(folder) => source.or_stored(move |hash| folder.read(&hash).ok()),
+            None => source,
+        }
+    }
+
+    /// What earlier processes left on disk.
+    pub(crate) fn on_disk(&self) -> Vec<Content> {
+        self.disk.iter().flat_map(DiskCache::contents).collect()
+    }
+
+    /// Pins a content that a job needs; false if it is not in memory.
+    pub(crate) fn pin(&mut self, hash: ContentHash) -> bool {
+        let here = self.memory.pin(hash);
+        self.figures.memory_hits += u64::from(here);
+        here
+    }
+
+    /// Brings a content here, from the disk if it is there, else by `fetch`; the outcome comes as an [`Input::Fetched`].
+    /// One that is on its way already is not fetched twice.
+    pub(crate) fn fetch(
+        &mut self,
+        content: Content,
+        fetch: impl Future<Output = Result<Bytes, String>> + Send + 'static,
+        inputs: mpsc::Sender<Input>,
+    ) {
+        if self.fetching.insert(content.hash, true).is_some() {
+            return;
+        }
+        let disk = self.disk.as_ref().filter(|disk| disk.has(&content.hash)).map(DiskCache::folder);
+        tokio::spawn(async move {
+            let stored = match &disk {
+                Some(folder) => read(folder.clone(), content).await,
+                None => None,
+            };
+            let (from_disk, disk_failed) = (stored.is_some(), disk.is_some() && stored.is_none());
+            let result = match stored {
+                Some(bytes) => Ok(bytes),
+                None => fetch.await,
+            };
+            let fetched = Fetched { result, from_disk, disk_failed };
+            // Without a driver the worker has ended.
+            let _ = inputs.send(Input::Fetched { content, fetched }).await;
+        });
+    }
+
+    /// A fetch is through: what the machine has to hear of it.
+    pub(crate) fn fetched(
+        &mut self,
+        content: Content,
+        fetched: Fetched,
+        inputs: &mpsc::Sender<Input>,
+    ) -> Vec<Event> {
+        let hash = content.hash;
+        let wanted = self.fetching.remove(&hash).unwrap_or(false);
+        if fetched.disk_failed
+            && let Some(disk) = &mut self.disk
+        {
+            disk.forget(&hash);
+        }
+        let mut events = Vec::new();
+        let failure = match fetched.result {
+            Ok(bytes) => {
+                if fetched.from_disk {
+                    self.figures.disk_hits += 1;
+                } else {
+                    self.figures.fetches += 1;
+                    self.figures.fetched_bytes += content.size_bytes;
+                }
+                self.keep(content, &bytes, fetched.from_disk, inputs);
+                self.take_in(hash, bytes, &mut events)
+            }
+            Err(reason) => Some(reason),
+        };
+        match (wanted, failure) {
+            (true, None) => events.push(Event::ContentReady(hash)),
+            (true, Some(reason)) => events.push(Event::ContentFailed { content: hash, reason }),
+            (false, _) => self.memory.release(hash),
+        }
+        events
+    }
+
+    /// No job needs a content any more.
+    pub(crate) fn release(&mut self, hash: ContentHash) {
+        self.memory.release(hash);
+        if let Some(wanted) = self.fetching.get_mut(&hash) {
+            *wanted = false;
+        }
+    }
+
+    /// A content has been written to disk, or could not be: what the machine has to hear of what went for it.
+    pub(crate) fn stored(&mut self, content: Content, result: io::Result<()>) -> Vec<Event> {
+        let Some(disk) = &mut self.disk else { return Vec::new() };
+        if let Err(error) = result {
+            tracing::warn!(content = %content.hash, %error, "a content cannot be kept on disk");
+            return Vec::new();
+        }
+        let gone = disk.written(content);
+        self.figures.disk_evictions += gone.len() as u64;
+        remove(disk.folder(), gone.clone());
+        gone.into_iter().filter(|hash| !self.memory.has(hash)).map(Event::ContentEvicted).collect()
+    }
+
+    /// Drops contents that no job needs, all such if none is named: what the machine has to hear of it.
+    pub(crate) fn evict(&mut self, named: &[ContentHash]) -> Vec<Event> {
+        let mut gone = Vec::new();
+        self.memory.evict(named, |hash| gone.push(hash));
+        if let Some(disk) = &mut self.disk {
+            let is_named = |hash: &ContentHash| named.is_empty() || named.contains(hash);
+            let unneeded: Vec<ContentHash> = disk
+                .contents()
+                .map(|content| content.hash)
+                .filter(|hash| is_named(hash) && !self.memory.has(hash) && !self.fetching.contains_key(hash))
+                .collect();
+            for hash in &unneeded {
+                disk.forget(hash);
+            }
+            gone.extend(&unneeded);
+            remove(disk.folder(), unneeded);
+        }
+        gone.sort_unstable();
+        gone.dedup();
+        gone.into_iter().map(Event::ContentEvicted).collect()
+    }
+
+    /// The figures, if they are others than those given last.
+    pub(crate) fn news(&mut self) -> Option<CacheFigures> {
+        let (memory_contents, memory_bytes) = self.memory.figures();
+        let (disk_contents, disk_bytes) = self.disk.as_ref().map_or((0, 0), DiskCache::figures);
+        let now = CacheFigures { memory_contents, memory_bytes, disk_contents, disk_bytes, ..self.figures };
+        (std::mem::replace(&mut self.told, now) != now).then_some(now)
+    }
+
+    /// Puts bytes into memory, pinned; the reason, for people, if there is no room.
+    fn take_in(&mut self, hash: ContentHash, bytes: Bytes, events: &mut Vec<Event>) -> Option<String> {
+        let Self { memory, disk, figures, .. } = self;
+        let taken = memory.insert(hash, bytes, |evicted| {
+            figures.memory_evictions += 1;
+            if disk.as_ref().is_none_or(|disk| !disk.has(&evicted)) {
+                events.push(Event::ContentEvicted(evicted));
+            }
+        });
+        taken.err().map(|full| {
+            format!(
+                "the content cache of {} B is full of contents in use ({} B)",
+                full.cap_bytes, full.pinned_bytes
+            )
+        })
+    }
+
+    /// Keeps a content on disk, if it is to be; the outcome comes as an [`Input::Stored`].
+    fn keep(&mut self, content: Content, bytes: &Bytes, from_disk: bool, inputs: &mpsc::Sender<Input>) {
+        let Some(disk) = &mut self.disk else { return };
+        if from_disk {
+            disk.touch(&content.hash);
+        } else if disk.wants(&content) {
+            let (folder, bytes, inputs) = (disk.folder(), bytes.clone(), inputs.clone());
+            tokio::spawn(async move {
+                let write = move || folder.write(&content.hash, &bytes);
+                let result = tokio::task::spawn_blocking(write).await.unwrap_or_else(|_| Ok(()));
+                let _ = inputs.send(Input::Stored { content, result }).await;
+            });
+        }
+    }
+}
+
+/// Reads a content from disk; `None` if it is not what it should be.
+async fn read(folder: Folder, content: Content) -> Option<Bytes> {
+    let read = tokio::task::spawn_blocking(move || folder.read(&content.hash)).await.ok()?;
+    match read {
+        Ok(bytes) if bytes.len() as u64 == content.size_bytes => Some(bytes),
+        // Its digest is right: the application is mistaken, and is told when it is asked.
+        Ok(_) => None,
+        Err(error) => {
+            tracing::warn!(content = %content.hash, %error, "a cached content is fetched again");
+            None
+        }
+    }
+}
+
+/// Removes files on a thread that may block.
+fn remove(folder: Folder, gone: Vec<ContentHash>) {
+    if !gone.is_empty() {
+        tokio::task::spawn_blocking(move || gone.iter().for_each(|hash| folder.remove(hash)));
+    }
+}
