@@ -1,6 +1,7 @@
 //! Farms in the simulator, each made to show one thing; many seeds of trouble; and the seeds that once found something.
 
 mod regressions;
+mod scenarios;
 mod seeds;
 mod steals;
 

@@ -9,7 +9,7 @@ use crate::{
     time::Instant,
 };
 
-/// When more than this part of all nodes is due to be given up at once, the fault is rather on this side.
+/// When more than this part of all nodes is silent at once, the fault is rather on this side.
 const GUARDED_PART: f64 = 0.55;
 
 /// Fewer nodes than this are given up without ado: two of three may well have died.
@@ -87,6 +87,7 @@ impl CoordinatorMachine {
         let mut dead = Vec::new();
         let mut rechecks = Vec::new();
         let mut relieved = false;
+        let mut silent = 0;
         for (&id, node) in &mut self.nodes {
             if node.full_until.is_some_and(|until| until <= now) {
                 node.full_until = None;
@@ -95,6 +96,7 @@ impl CoordinatorMachine {
             rechecks.extend(node.recheck.take_if(|recheck| recheck.at <= now).map(|recheck| (id, recheck)));
             let silence = now.since(node.last_heard);
             let at_least = |bound_ms| silence >= Duration::from_millis(bound_ms);
+            silent += usize::from(node.link.is_none() || at_least(liveness.suspect_ms));
             match node.link {
                 // Silent on a standing connection: a partition, as far as one can tell from here.
                 Some(_) if at_least(liveness.dead_ms) => dead.push((id, Blame::Nobody)),
@@ -106,34 +108,27 @@ impl CoordinatorMachine {
         for (id, recheck) in rechecks {
             self.recheck(id, recheck);
         }
-        self.declare_dead(now, dead);
+        self.declare_dead(now, silent, dead);
         if relieved {
             self.retry_stuck();
         }
     }
 
-    /// The one place where nodes are given up for their silence. If most of the farm is due at once nothing is planned anew
-    /// for as long as a node may be silent: then they are back, or gone indeed (20-delivery.md, "most nodes vanish at once").
-    fn declare_dead(&mut self, now: Instant, dead: Vec<(NodeId, Blame)>) {
-        let most =
-            dead.len() >= LEAST_GUARDED_NODES && dead.len() as f64 > GUARDED_PART * self.nodes.len() as f64;
-        if most {
-            let guard = Duration::from_millis(self.config.liveness.dead_ms);
-            let until = *self.guarded_until.get_or_insert_with(|| {
-                tracing::error!(
-                    silent = dead.len(),
-                    of = self.nodes.len(),
-                    ?guard,
-                    "most nodes vanished at once"
-                );
-                now.after(guard)
-            });
-            if now < until {
+    /// The one place where nodes are given up for their silence. If most of the farm is silent when the first of them is due
+    /// nothing is planned anew for as long as a node may be silent: then they are back, or gone indeed (20-delivery.md, "most
+    /// nodes vanish at once"). What counts is who is silent, not who is due: nodes that were cut off at one instant are due one
+    /// after the other, each by its own last heartbeat.
+    fn declare_dead(&mut self, now: Instant, silent: usize, dead: Vec<(NodeId, Blame)>) {
+        let most = silent >= LEAST_GUARDED_NODES && silent as f64 > GUARDED_PART * self.nodes.len() as f64;
+        match self.guarded_until {
+            Some(until) if now < until => return,
+            None if most && !dead.is_empty() => {
+                let guard = Duration::from_millis(self.config.liveness.dead_ms);
+                tracing::error!(silent, of = self.nodes.len(), ?guard, "most nodes vanished at once");
+                self.guarded_until = Some(now.after(guard));
                 return;
             }
-        }
-        if !dead.is_empty() {
-            self.guarded_until = None;
+            Some(_) | None => self.guarded_until = None,
         }
         for (id, blame) in dead {
             self.remove_node(now, id, blame);

@@ -41,6 +41,11 @@ impl WorkerMachine {
         self.tell_coordinator(NodeToCoordinator::Retracted { steal, retracted, running, unknown });
     }
 
+    /// Whether a job is here and its device has not had it yet, as far as is known.
+    pub(super) fn waits_here(&self, job: JobAttempt) -> bool {
+        self.find(job) == Found::Waiting
+    }
+
     fn find(&self, job: JobAttempt) -> Found {
         match self.jobs.get(&job.job) {
             Some(held) if held.attempt == job.attempt => match held.state {

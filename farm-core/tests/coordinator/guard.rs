@@ -1,5 +1,7 @@
 //! Most nodes vanish at once: the fault is rather on the coordinator's side, and nothing is planned anew for a while.
 
+use std::time::Duration;
+
 use crate::farm::Farm;
 
 /// Five nodes with a job each; the connections of some are gone, and the time that they had to come back is over.
@@ -26,6 +28,39 @@ fn most_of_a_farm_is_waited_for_once_more() {
     let planned = farm.wait_for_plan();
     assert_eq!(farm.now.0 / 1_000_000, 12_000, "and as long again as a node may be silent");
     assert_eq!(planned.values().map(Vec::len).sum::<usize>(), 4, "then they are gone indeed");
+}
+
+#[test]
+fn nodes_that_vanish_one_after_the_other_are_waited_for_together() {
+    let mut farm = vanished(1);
+    for node in 2..=4 {
+        farm.now = farm.now.after(Duration::from_millis(300));
+        farm.stop_taking(node);
+    }
+    let planned = farm.wait_for_plan();
+    assert_eq!(farm.now.0 / 1_000_000, 12_000, "the first was due after 2 s, and nothing was planned then");
+    assert_eq!(planned.values().map(Vec::len).sum::<usize>(), 4, "then they are gone indeed");
+}
+
+#[test]
+fn a_second_time_they_are_waited_for_again() {
+    let mut farm = vanished(4);
+    farm.advance_to_ms(3_000);
+    for node in 1..=4 {
+        farm.node_joins(node, 1_000.0);
+    }
+    // They came back with nothing, so what they had is planned anew.
+    farm.wait_for_plan();
+    farm.advance_to_ms(60_000);
+    for node in 1..=4 {
+        farm.stop_taking(node);
+    }
+    farm.wait_for_plan();
+    assert_eq!(
+        farm.now.0 / 1_000_000,
+        72_000,
+        "the time to reconnect, and as long again as a node may be silent"
+    );
 }
 
 #[test]

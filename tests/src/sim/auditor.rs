@@ -380,6 +380,7 @@ impl World {
     pub(super) fn audit_said(&mut self, message: &Message) {
         if let Message::CoordinatorToApp(CoordinatorToApp::Plan(plan)) = message {
             self.audit.planned(plan);
+            self.diary.planned(self.now, plan);
         }
     }
 }

@@ -13,6 +13,10 @@ use super::{
     world::{Happening, World},
 };
 
+/// How long a dead connection stands: HTTP/2 pings every 5 s wait 5 s for their answer, QUIC's idle time is 10 s
+/// (`proto/src/control/transport.rs`, `proto/src/link/connect.rs`).
+pub const KEEPALIVE: Duration = Duration::from_secs(10);
+
 /// One thing that goes wrong, or comes right.
 #[derive(Clone, Debug)]
 pub enum Fault {
@@ -24,6 +28,27 @@ pub enum Fault {
     SilenceAny(Duration),
     /// Some connection holds everything back for this time.
     StallAny(Duration),
+    /// Every connection of a process holds everything back for this time.
+    Stall {
+        /// Whose.
+        proc: Proc,
+        /// For how long.
+        duration: Duration,
+    },
+    /// An application reads no results for this time.
+    Deafen {
+        /// Which.
+        app: usize,
+        /// For how long.
+        duration: Duration,
+    },
+    /// The keepalives of two processes give up the connections between them.
+    TimeOut {
+        /// One of the two.
+        one: Proc,
+        /// The other one.
+        other: Proc,
+    },
     /// Nothing gets through from one process to another for this time, and nobody is told.
     Partition {
         /// Who is not heard.
@@ -46,6 +71,19 @@ pub enum Fault {
         worker: usize,
         /// Its pause.
         restart: Option<Duration>,
+    },
+    /// A worker's process is gone as in [`Self::Kill`], but what it said is still on its way, and arrives; nobody learns of its
+    /// end before.
+    Abandon {
+        /// Which.
+        worker: usize,
+        /// Its pause.
+        restart: Duration,
+    },
+    /// A worker's machine is off, for good: its connections fall silent, until its peers' keepalives give them up.
+    PowerOff {
+        /// Which.
+        worker: usize,
     },
     /// A killed worker is started again.
     Start {
@@ -149,6 +187,11 @@ impl World {
                     self.stall_link(link, duration);
                 }
             }
+            Fault::Stall { proc, duration } => {
+                self.links_of(proc).into_iter().for_each(|link| self.stall_link(link, duration));
+            }
+            Fault::Deafen { app, duration } => self.deafen(app, duration),
+            Fault::TimeOut { one, other } => self.break_links(one, other),
             Fault::Partition { from, to, duration } => {
                 self.block(from, to);
                 self.after(duration, Happening::Fault(Fault::Heal { from, to }));
@@ -158,6 +201,15 @@ impl World {
                 self.kill_worker(worker);
                 if let Some(pause) = restart {
                     self.after(pause, Happening::Fault(Fault::Start { worker }));
+                }
+            }
+            Fault::Abandon { worker, restart } => {
+                self.abandon_worker(worker);
+                self.after(restart, Happening::Fault(Fault::Start { worker }));
+            }
+            Fault::PowerOff { worker } => {
+                for link in self.power_off(worker) {
+                    self.after(KEEPALIVE, Happening::Fault(Fault::Break(link)));
                 }
             }
             Fault::Start { worker } => self.start_worker(worker),

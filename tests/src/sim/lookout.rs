@@ -13,7 +13,7 @@ use farm_core::{
 use super::{
     network::Message,
     work::{MAX_COST_NS, cost_ns},
-    world::{World, liveness},
+    world::World,
 };
 
 /// Virtual time between two looks.
@@ -83,7 +83,7 @@ impl World {
 
     /// Nothing went wrong for long enough that every silence was noticed and every doubt settled.
     fn is_undisturbed(&self) -> bool {
-        let timings = liveness();
+        let timings = self.setup.liveness;
         let settled = Duration::from_millis(timings.dead_ms + timings.reconnect_ms).mul_f64(SKEW);
         let last = self.audit.last_disturbance();
         last.is_none_or(|last| self.now.since(last) > settled)
@@ -145,7 +145,8 @@ impl World {
     /// I6: no healthy device has nothing to do for long while a compatible job is queued within reach.
     fn look_for_idleness(&mut self) {
         let now = self.now;
-        let bound = 2 * (Duration::from_millis(liveness().heartbeat_ms) + STEAL_LATENCY) + MAX_STEAL_PAUSE;
+        let bound =
+            2 * (Duration::from_millis(self.setup.liveness.heartbeat_ms) + STEAL_LATENCY) + MAX_STEAL_PAUSE;
         let bound = bound.mul_f64(SKEW);
         let long_ago = |since: Option<Instant>| since.is_some_and(|since| now.since(since) > bound);
         self.note_riches();

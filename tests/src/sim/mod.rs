@@ -6,13 +6,14 @@
 //!
 //! `world` is virtual time and the event loop, `network` the connections, `clock` what processes see of time, `hosts` the
 //! thin drivers of the machines, `work` what jobs do; `faults` what can go wrong, `weather` and `storm` when; `auditor`
-//! judges by what is said, `lookout` by what is; `scenario` names it all. `million` measures the coordinator.
+//! judges by what is said, `lookout` by what is; `diary` is for whoever measures; `scenario` names it all. `million` measures the coordinator.
 //!
 //! A new kind of trouble is a variant of [`faults::Fault`] and of `weather::Kind`; a new kind of farm a
 //! [`scenario::Scenario`]. What a machine newly wants of its driver is carried out in its host.
 
 pub mod auditor;
 pub mod clock;
+pub mod diary;
 pub mod faults;
 pub mod hosts;
 pub mod log;

@@ -105,6 +105,8 @@ pub(super) struct Link {
     life: Option<(NodeId, NodeSession)>,
     /// Messages vanish.
     silent: bool,
+    /// This end's process is gone; what it said is still on its way.
+    gone: Option<Proc>,
     /// Last arrival at the dialler and at the listener.
     last_arrival: [Instant; 2],
     latency_us: (u64, u64),
@@ -169,7 +171,7 @@ impl World {
             Distances::Mixed => MIXED_US[self.rng.random_range(0..MIXED_US.len())],
         };
         let last_arrival = [self.now; 2];
-        let link = Link { dialler, listener, life, silent: false, last_arrival, latency_us };
+        let link = Link { dialler, listener, life, silent: false, gone: None, last_arrival, latency_us };
         self.links.insert(id, link);
         id
     }
@@ -214,14 +216,19 @@ impl World {
         if link.silent || self.blocked.contains(&(from, to)) {
             return false;
         }
-        let arrival = self.now.after(latency).max(link.last_arrival[side]);
+        let read_at = match (from, to) {
+            (Proc::Worker(_), Proc::App(app)) => self.apps[app].deaf_until,
+            _ => Instant::ZERO,
+        };
+        let arrival = self.now.after(latency).max(link.last_arrival[side]).max(read_at);
         link.last_arrival[side] = arrival;
         self.at(arrival, Happening::Arrives { link: id, to, message });
         true
     }
 
     pub(super) fn arrives(&mut self, id: LinkId, to: Proc, message: Message) {
-        let Some(link) = self.links.get(&id).filter(|link| !link.silent) else { return };
+        let heard = |link: &&Link| !link.silent && link.gone != Some(to);
+        let Some(link) = self.links.get(&id).filter(heard) else { return };
         let life = link.life;
         match (to, message) {
             (Proc::Coordinator, Message::AppToCoordinator(message)) => {
@@ -305,6 +312,20 @@ impl World {
         }
     }
 
+    /// The connections between two processes break.
+    pub(super) fn break_links(&mut self, one: Proc, other: Proc) {
+        for link in self.links_between(one, other).into_iter().chain(self.links_between(other, one)) {
+            self.break_link(link);
+        }
+    }
+
+    /// One end's process is gone; what it said still arrives, then the other end learns of it.
+    pub(super) fn abandon(&mut self, from: Proc, id: LinkId) {
+        let Some(link) = self.links.get_mut(&id) else { return };
+        link.gone = Some(from);
+        self.hang_up(from, id);
+    }
+
     /// Messages on a connection vanish.
     pub(super) fn silence_link(&mut self, id: LinkId) {
         let Some(link) = self.links.get_mut(&id) else { return };
@@ -331,9 +352,7 @@ impl World {
     /// Things get through again; connections of the time of the partition have timed out.
     pub(super) fn unblock(&mut self, from: Proc, to: Proc) {
         if self.blocked.remove(&(from, to)) {
-            for link in self.links_between(from, to).into_iter().chain(self.links_between(to, from)) {
-                self.break_link(link);
-            }
+            self.break_links(from, to);
         }
     }
 
@@ -393,7 +412,8 @@ impl World {
             Proc::App(index) if !self.apps[index].is_active() => return false,
             Proc::App(index) => self.apps[index].control,
         };
-        control.is_none() && self.links_between(proc, Proc::Coordinator).is_empty()
+        let dials = |link: &Link| link.ends() == [proc, Proc::Coordinator] && link.gone != Some(proc);
+        control.is_none() && !self.links.values().any(dials)
     }
 }
 

@@ -108,6 +108,22 @@ pub const SCENARIOS: &[Scenario] = &[
         ]),
     },
     Scenario {
+        name: "steals",
+        about: "thieves race for victims that start, die and hear everything twice or late, while tasks are cancelled",
+        story: Story::Weather(&[
+            Kind::Stealing,
+            Kind::Scores,
+            Kind::Grey,
+            Kind::Joins,
+            Kind::Restarts,
+            Kind::Deaths,
+            Kind::Cancels,
+            Kind::Doubles,
+            Kind::Stalls,
+            Kind::Distance,
+        ]),
+    },
+    Scenario {
         name: "classes",
         about: "interactive jobs interrupt batch jobs on devices that are slow, get lost and are drained",
         story: Story::Weather(&[

@@ -1,6 +1,6 @@
 //! What jobs do when they run: how long they take, what they compute, which of them go wrong.
 
-use std::collections::BTreeSet;
+use std::{collections::BTreeSet, time::Duration};
 
 use farm_core::{
     device::Requirements,
@@ -18,6 +18,10 @@ use super::world::{Happening, MILLISECOND, World};
 pub struct Work {
     /// Tasks whose jobs crash whatever runs them.
     pub poison: BTreeSet<TaskId>,
+    /// Tasks whose jobs never end: their executor ends them at [`JOB_LIMIT`].
+    pub hangs: BTreeSet<TaskId>,
+    /// Jobs that take the worker's process along when they end.
+    pub deadly: BTreeSet<(TaskId, JobIndex)>,
     /// Tasks whose jobs are wrong.
     pub invalid: BTreeSet<TaskId>,
     /// One in this many runs ends with a retryable failure; 0 for none.
@@ -40,6 +44,14 @@ pub(super) fn digest(job: JobId) -> ContentHash {
 pub fn cost_ns(index: JobIndex) -> u64 {
     100_000 + u64::from(index.0.wrapping_mul(2_654_435_761) % 19_900) * 1_000
 }
+
+/// Lengths of a job's result: a few kilobytes at most.
+pub(super) fn result_sections(index: JobIndex) -> Vec<u64> {
+    vec![4, u64::from(index.0) * 4]
+}
+
+/// What an executor gives a job.
+pub const JOB_LIMIT: Duration = Duration::from_secs(10);
 
 /// Most that [`cost_ns`] gives.
 pub(super) const MAX_COST_NS: u64 = 20_000_000;

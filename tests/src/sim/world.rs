@@ -7,10 +7,10 @@ use std::{
 
 use farm_core::{
     coordinator::{
-        self, CoordinatorMachine,
+        self, CoordinatorConfig, CoordinatorMachine,
         policy::{Choice, QuestionId},
     },
-    id::{DeviceIndex, LinkId, NodeId, NodeSession},
+    id::{DeviceIndex, Epoch, LinkId, NodeId, NodeSession},
     ledger, message,
     time::Instant,
     worker,
@@ -20,6 +20,7 @@ use rand::{Rng, SeedableRng, rngs::SmallRng};
 use super::{
     auditor::Auditor,
     clock::Clock,
+    diary::Diary,
     faults::Fault,
     hosts::{AppHost, Store, WorkerHost},
     log::Log,
@@ -42,6 +43,10 @@ pub const RECOVERY: Duration = Duration::from_secs(120);
 /// Longest virtual time from the last goodbye until nothing is kept (I8): a node that heard no goodbye waits 30 s for
 /// an announcement.
 pub const QUIET: Duration = Duration::from_secs(40);
+
+/// How long a vanished application keeps its jobs in a run of seconds, in milliseconds: three times what a silent node
+/// gets, as in the design.
+const SHORT_APP_LEASE_MS: u64 = 3_000;
 
 /// Virtual time of a millisecond, in nanoseconds.
 pub const MILLISECOND: u64 = 1_000_000;
@@ -167,6 +172,12 @@ pub struct Setup {
     pub max_crashes: u32,
     /// Most jobs on one worker.
     pub max_jobs: usize,
+    /// Most bytes of one application's results that wait on one worker, before it gets no device there.
+    pub spool_quota_bytes: u64,
+    /// Who is silent for how long is what.
+    pub liveness: message::Liveness,
+    /// How long a vanished application keeps its jobs, in milliseconds.
+    pub app_lease_ms: u64,
     /// The applications allow it.
     pub global_stealing: bool,
     /// Every other application's jobs are interactive.
@@ -191,12 +202,26 @@ impl Setup {
             apps,
             max_crashes: 3,
             max_jobs: 10_000,
+            spool_quota_bytes: 1 << 30,
+            liveness: short_liveness(),
+            app_lease_ms: SHORT_APP_LEASE_MS,
             global_stealing: false,
             interactive: false,
             plugin: false,
             score_error: 1.0,
             skewed_clocks: false,
             distances: Distances::Lan,
+        }
+    }
+
+    /// A farm without trouble that waits as long as the design says.
+    #[must_use]
+    pub fn designed(seed: u64, workers: Vec<Vec<f64>>, apps: usize) -> Self {
+        let design = CoordinatorConfig::new(Epoch(1), seed);
+        Self {
+            liveness: design.liveness,
+            app_lease_ms: design.app_lease_ms,
+            ..Self::calm(seed, workers, apps)
         }
     }
 }
@@ -218,6 +243,8 @@ pub struct World {
     pub work: Work,
     /// Judges everything.
     pub audit: Auditor,
+    /// What happened when.
+    pub diary: Diary,
     pub(super) lookout: Lookout,
     /// Everything that any machine wanted.
     pub log: Log,
@@ -243,9 +270,8 @@ pub struct World {
     timer_rounds: u32,
 }
 
-/// Silences in the simulation: a tenth of the design's, so that a run of seconds sees each of them.
-#[must_use]
-pub const fn liveness() -> message::Liveness {
+/// A tenth of what the design has, so that a run of seconds sees each silence.
+const fn short_liveness() -> message::Liveness {
     message::Liveness { heartbeat_ms: 100, suspect_ms: 300, dead_ms: 1_000, reconnect_ms: 400 }
 }
 
@@ -257,11 +283,12 @@ impl World {
         let mut world = Self {
             now: Instant::ZERO,
             rng: SmallRng::seed_from_u64(setup.seed),
-            coordinator: store.coordinator(setup.seed, setup.max_crashes),
+            coordinator: store.coordinator(setup.seed, &setup),
             workers: Vec::new(),
             apps: Vec::new(),
             work: Work::default(),
             audit: Auditor::default(),
+            diary: Diary::default(),
             lookout: Lookout::default(),
             log: Log::new(),
             cuts: BTreeSet::new(),
@@ -285,12 +312,19 @@ impl World {
         for speeds in world.setup.workers.clone() {
             world.add_worker(&speeds);
         }
-        for app in 0..world.setup.apps {
-            let clock = world.new_clock();
-            world.apps.push(AppHost::new(app, &world.setup, clock));
-            world.after(Duration::ZERO, Happening::Dial { proc: Proc::App(app), life: 0 });
+        for _ in 0..world.setup.apps {
+            world.add_app();
         }
         world
+    }
+
+    /// One more application starts. Gives its index.
+    pub fn add_app(&mut self) -> usize {
+        let app = self.apps.len();
+        let clock = self.new_clock();
+        self.apps.push(AppHost::new(app, &self.setup, clock));
+        self.after(Duration::ZERO, Happening::Dial { proc: Proc::App(app), life: 0 });
+        app
     }
 
     /// One more worker starts.
@@ -304,7 +338,7 @@ impl World {
             vec![1.0; speeds.len()]
         };
         let clock = self.new_clock();
-        let mut host = WorkerHost::new(index, speeds, errors, self.setup.max_jobs);
+        let mut host = WorkerHost::new(index, speeds, errors, &self.setup);
         host.start(self.now, seed, clock);
         self.workers.push(host);
         self.after(Duration::ZERO, Happening::Dial { proc: Proc::Worker(index), life: 0 });

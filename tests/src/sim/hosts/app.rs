@@ -64,6 +64,8 @@ pub struct AppHost {
     state: State,
     global_stealing: bool,
     policy: &'static str,
+    /// It reads no results before.
+    pub(in crate::sim) deaf_until: Instant,
     pub(in crate::sim) control: Option<LinkId>,
     pub(in crate::sim) nodes: BTreeMap<(NodeId, NodeSession), LinkId>,
     programs: BTreeSet<(TaskId, JobIndex)>,
@@ -96,6 +98,7 @@ impl AppHost {
             state: State::Up,
             global_stealing,
             policy,
+            deaf_until: Instant::ZERO,
             control: None,
             nodes: BTreeMap::new(),
             programs: BTreeSet::new(),
@@ -173,6 +176,9 @@ impl World {
                 self.audit.forgotten(*app);
             }
         }
+        if let CoordinatorToApp::Plan(plan) = &message {
+            self.diary.told(plan);
+        }
         self.app_event(index, Event::FromCoordinator(message));
     }
 
@@ -184,6 +190,7 @@ impl World {
         message: NodeToApp,
     ) {
         if let NodeToApp::Result(header) = &message {
+            self.diary.arrives(self.now, header.job);
             if header.outcome.is_ok() {
                 assert_eq!(header.digest, digest(header.job.job), "I3: {} has another payload", header.job);
             }
@@ -235,6 +242,13 @@ impl World {
             self.apps[index].ledger.check_invariants();
         }
         self.rearm(Proc::App(index));
+    }
+
+    /// It reads no results for a while.
+    pub(in crate::sim) fn deafen(&mut self, index: usize, duration: Duration) {
+        let until = self.now.after(duration);
+        self.apps[index].deaf_until = until;
+        self.audit.disturbed(until, Proc::App(index), Proc::App(index));
     }
 
     /// The process is gone, without a word. It comes back after a while, if at all.
@@ -308,6 +322,7 @@ impl World {
             }
             Effect::Deliver { job, node, .. } => {
                 self.take_payload(index, job, digest(job.job));
+                self.diary.counts(job);
                 self.end(index, job.job, Ending::Delivered(node));
             }
             Effect::Fail { job, failure } => self.end(index, job, Ending::Failed(failure)),
@@ -331,6 +346,7 @@ impl World {
 
     fn end(&mut self, index: usize, job: JobId, ending: Ending) {
         self.audit.ends(job, &ending, self.setup.max_crashes);
+        self.diary.ends(self.now, job);
         let before = self.apps[index].endings.insert((job.task, job.index), ending.clone());
         assert_eq!(before, None, "I2: {job} ended twice, now {ending:?}");
     }

@@ -7,19 +7,16 @@ use farm_core::{
         CoordinatorConfig, CoordinatorMachine, Effect, Event,
         policy::{Choice, Question, QuestionId},
     },
-    id::Epoch,
+    id::{Epoch, LinkId},
+    message::CoordinatorToNode,
 };
 use rand::{Rng as _, SeedableRng as _, rngs::SmallRng};
 
 use crate::sim::{
     auditor::Auditor,
     network::{Message, Proc},
-    world::{Happening, World, liveness},
+    world::{Happening, Setup, World},
 };
-
-/// How long a vanished application keeps its jobs, in milliseconds: three times what a silent node gets, as in the
-/// design.
-const APP_LEASE_MS: u64 = 3_000;
 
 /// The plug-in that the coordinator knows.
 pub(in crate::sim) const PLUGIN: &str = "plugin";
@@ -32,12 +29,12 @@ pub(in crate::sim) struct Store {
 
 impl Store {
     /// A process that starts on this store.
-    pub(in crate::sim) fn coordinator(self, seed: u64, max_crashes: u32) -> CoordinatorMachine {
+    pub(in crate::sim) fn coordinator(self, seed: u64, setup: &Setup) -> CoordinatorMachine {
         let config = CoordinatorConfig::new(Epoch(self.epoch), seed);
         CoordinatorMachine::new(CoordinatorConfig {
-            liveness: liveness(),
-            app_lease_ms: APP_LEASE_MS,
-            max_crashes,
+            liveness: setup.liveness,
+            app_lease_ms: setup.app_lease_ms,
+            max_crashes: setup.max_crashes,
             plugins: [PLUGIN.to_owned()].into(),
             ..config
         })
@@ -68,7 +65,7 @@ impl World {
         self.coordinator_up = true;
         self.audit.coordinator_began(self.store.epoch);
         self.coordinator_clock = self.new_clock();
-        self.coordinator = self.store.coordinator(self.store.epoch.into(), self.setup.max_crashes);
+        self.coordinator = self.store.coordinator(self.store.epoch.into(), &self.setup);
         self.rearm(Proc::Coordinator);
     }
 
@@ -94,6 +91,7 @@ impl World {
                     self.send(Proc::Coordinator, link, Message::CoordinatorToApp(message));
                 }
                 Effect::ToNode { link, message } => {
+                    self.note_registration(link, &message);
                     self.send(Proc::Coordinator, link, Message::CoordinatorToNode(message));
                 }
                 Effect::Close { link } => self.hang_up(Proc::Coordinator, link),
@@ -101,6 +99,13 @@ impl World {
             }
         }
         self.rearm(Proc::Coordinator);
+    }
+
+    fn note_registration(&mut self, link: LinkId, message: &CoordinatorToNode) {
+        let dialler = self.links.get(&link).map(|link| link.dialler);
+        if let (CoordinatorToNode::Welcome { .. }, Some(Proc::Worker(worker))) = (message, dialler) {
+            self.diary.registers(self.now, worker);
+        }
     }
 
     /// Half of the answers are good ones; the others come too late or never, are none, or leave a job out.

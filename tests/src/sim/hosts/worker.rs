@@ -7,7 +7,7 @@ use std::{
 
 use farm_core::{
     device::{DeviceInfo, DeviceKind, Features, Limits},
-    id::{Attempt, ContentHash, DeviceIndex, JobAttempt, JobId, LinkId, NodeSession},
+    id::{AppId, Attempt, ContentHash, DeviceIndex, JobAttempt, JobId, LinkId, NodeSession},
     message::{AppToNode, Contact, CoordinatorToNode, JobFailure, LatencyClass, NodeToApp},
     time::Instant,
     worker::{Effect, Event, Provider, Share, WorkerConfig, WorkerMachine},
@@ -17,10 +17,14 @@ use rand::Rng;
 use crate::sim::{
     auditor::worker_at,
     clock::Clock,
+    faults::Fault,
     network::{Message, Proc},
-    work::{cost_ns, digest},
-    world::{Happening, World},
+    work::{JOB_LIMIT, cost_ns, digest, result_sections},
+    world::{Happening, Setup, World},
 };
+
+/// Pause of whoever starts workers again after a crash.
+const RESTART: Duration = Duration::from_secs(1);
 
 /// A worker's process: gone and started again it has another session and an empty memory.
 #[derive(Debug)]
@@ -31,6 +35,7 @@ pub struct WorkerHost {
     /// What each announced score is times the true one.
     score_errors: Vec<f64>,
     max_jobs: usize,
+    spool_quota_bytes: u64,
     pub(in crate::sim) life: u32,
     pub(in crate::sim) session: NodeSession,
     clock: Clock,
@@ -98,12 +103,13 @@ impl Executor {
 }
 
 impl WorkerHost {
-    pub(in crate::sim) fn new(index: usize, speeds: &[f64], score_errors: Vec<f64>, max_jobs: usize) -> Self {
+    pub(in crate::sim) fn new(index: usize, speeds: &[f64], score_errors: Vec<f64>, setup: &Setup) -> Self {
         Self {
             index,
             speeds: speeds.to_vec(),
             score_errors,
-            max_jobs,
+            max_jobs: setup.max_jobs,
+            spool_quota_bytes: setup.spool_quota_bytes,
             life: 0,
             session: NodeSession(0),
             clock: Clock::TRUE,
@@ -146,7 +152,7 @@ impl WorkerHost {
                 certificate_der: Vec::new(),
             },
             max_jobs: self.max_jobs,
-            spool_quota_bytes: 1 << 30,
+            spool_quota_bytes: self.spool_quota_bytes,
             share: Share::DEFAULT,
             local_stealing: true,
             cached: Vec::new(),
@@ -213,6 +219,13 @@ impl WorkerHost {
     pub(in crate::sim) fn kept(&self) -> usize {
         let on_devices = self.devices.iter().map(|device| device.held().count()).sum::<usize>();
         self.programs.len() + self.payloads.len() + on_devices
+    }
+
+    /// Bytes of an application's results that wait here.
+    #[must_use]
+    pub fn spooled_bytes(&self, app: AppId) -> u64 {
+        let of_app = self.payloads.keys().filter(|job| job.job.app == app);
+        of_app.flat_map(|job| result_sections(job.job.index)).sum()
     }
 
     /// I8: at quiescence nothing is kept.
@@ -321,6 +334,7 @@ impl World {
             self.hang_up(Proc::Worker(index), link);
         }
         self.workers[index].stop();
+        self.diary.cut_off(self.now, index, None);
     }
 
     /// The process is killed.
@@ -332,7 +346,36 @@ impl World {
         for link in self.links_of(Proc::Worker(index)) {
             self.drop_link(link);
         }
+        self.end_process(index);
+    }
+
+    /// The process is gone, with words of its on their way.
+    pub(in crate::sim) fn abandon_worker(&mut self, index: usize) {
+        if !self.workers[index].is_up() {
+            return;
+        }
+        self.audit.disturbed(self.now, Proc::Worker(index), Proc::Worker(index));
+        for link in self.links_of(Proc::Worker(index)) {
+            self.abandon(Proc::Worker(index), link);
+        }
+        self.end_process(index);
+    }
+
+    /// The process is gone, its connections silent. Gives them.
+    pub(in crate::sim) fn power_off(&mut self, index: usize) -> Vec<LinkId> {
+        if !self.workers[index].is_up() {
+            return Vec::new();
+        }
+        self.audit.disturbed(self.now, Proc::Worker(index), Proc::Worker(index));
+        let links = self.links_of(Proc::Worker(index));
+        links.iter().for_each(|&link| self.silence_link(link));
+        self.end_process(index);
+        links
+    }
+
+    fn end_process(&mut self, index: usize) {
         self.workers[index].stop();
+        self.diary.cut_off(self.now, index, None);
         self.rearm(Proc::Worker(index));
     }
 
@@ -425,7 +468,8 @@ impl World {
                 clippy::cast_sign_loss,
                 reason = "milliseconds, far from the limits"
             )]
-            let left = Duration::from_nanos((cost_ns(job.job.index) as f64 / speed) as u64);
+            let takes = Duration::from_nanos((cost_ns(job.job.index) as f64 / speed) as u64);
+            let left = if self.work.hangs.contains(&job.job.task) { JOB_LIMIT } else { takes };
             Some(Run { job, class, number: 0, started_at: self.now, left, ran_before: Duration::ZERO })
         }) else {
             executor.idle_since.get_or_insert(self.now);
@@ -440,6 +484,7 @@ impl World {
             Some(_) => Event::Resumed { job, device },
             None => {
                 self.audit.begins(index, job.job);
+                self.diary.begins(self.now, index, device, job);
                 Event::Started { job, device }
             }
         };
@@ -453,15 +498,20 @@ impl World {
         let Some(run) = running.take_if(|run| run.number == number) else { return };
         let took = run.ran_before + host.clock.shows(self.now).since(host.clock.shows(run.started_at));
         let job = run.job;
+        self.diary.is_off(self.now, job);
         let crashes = self.work.crash_one_in > 0 && self.rng.random_ratio(1, self.work.crash_one_in);
-        let outcome = if self.work.poison.contains(&job.job.task) || crashes {
+        if self.work.deadly.contains(&(job.job.task, job.job.index)) {
+            return self.fault(Fault::Kill { worker: index, restart: Some(RESTART) });
+        }
+        let hangs = self.work.hangs.contains(&job.job.task);
+        let outcome = if self.work.poison.contains(&job.job.task) || hangs || crashes {
             self.audit.crashed(job.job, self.setup.max_crashes);
             Err(JobFailure::Timeout)
         } else if self.work.invalid.contains(&job.job.task) {
             Err(JobFailure::InvalidProgram("simulated".to_owned()))
         } else {
             self.workers[index].payloads.insert(job, digest(job.job));
-            Ok((vec![4, u64::from(job.job.index.0) * 4], digest(job.job)))
+            Ok((result_sections(job.job.index), digest(job.job)))
         };
         self.run_next(index, device);
         let device_time_ns = u64::try_from(took.as_nanos()).expect("short");
@@ -478,6 +528,7 @@ impl World {
         if run.started_at == self.now && run.ran_before.is_zero() {
             self.audit.did_not_begin(job.job);
         }
+        self.diary.is_off(self.now, job);
         let life = host.life;
         let event = Event::Executed { job, device, device_time_ns: 0, outcome: Err(JobFailure::Cancelled) };
         self.after(Duration::from_micros(10), Happening::Worker { worker: index, life, event });
@@ -489,6 +540,7 @@ impl World {
         let executor = host.devices.get_mut(usize::from(device.0));
         let Some(executor) = executor.filter(|executor| !executor.lost) else { return };
         *executor = Executor { lost: true, ..Executor::new(self.now) };
+        self.diary.cut_off(self.now, index, Some(device));
         self.audit.disturbed(self.now, Proc::Worker(index), Proc::Worker(index));
         self.worker_event(index, Event::DeviceLost { device, reason: "simulated".to_owned() });
     }
