@@ -16,7 +16,7 @@ mod web;
 use std::{
     hash::{BuildHasher as _, Hasher as _, RandomState},
     net::SocketAddr,
-    path::PathBuf,
+    path::{Path, PathBuf},
     sync::Arc,
     time::Duration,
 };
@@ -188,6 +188,15 @@ impl CoordinatorHandle {
         // It holds the state directory, too.
         renewal.shutdown().await;
     }
+}
+
+/// Reads all that a state directory's control store keeps: one that passes can be started on. Takes no epoch; makes what is
+/// not there.
+///
+/// # Errors
+/// The state directory cannot be used; the error names it or its file.
+pub fn check_state(directory: &Path) -> Result<(), StartError> {
+    Store::open(directory)?.read_all()
 }
 
 /// Starts a coordinator on the current tokio runtime.

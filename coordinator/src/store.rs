@@ -4,8 +4,10 @@
 //! A redb database: what a method has returned is on disk, and after a crash the store is what was committed last.
 
 use std::{
+    any::Any,
     fs, io,
     ops::Not as _,
+    panic::catch_unwind,
     path::{Path, PathBuf},
     time::SystemTime,
 };
@@ -103,14 +105,30 @@ impl Store {
     pub(crate) fn open(directory: &Path) -> Result<Self, StartError> {
         fs::create_dir_all(directory).map_err(|error| fault(directory, &error))?;
         let path = directory.join(FILE);
-        let database =
-            Database::builder().set_cache_size(CACHE_BYTES).create(&path).map_err(|error| match error {
-                DatabaseError::DatabaseAlreadyOpen => fault(directory, &"another coordinator uses it"),
-                error => fault(&path, &error),
-            })?;
+        // The database asserts, deep inside, what its file's header says: on a file that was cut or changed it panics.
+        let opened = catch_unwind(|| Self::open_database(directory, &path));
+        let database = opened.unwrap_or_else(|panic| Err(fault(&path, &damage(panic.as_ref()))))?;
         let store = Self { path, database };
         store.begin(directory)?;
         Ok(store)
+    }
+
+    /// Opens the database and reads it whole: damage shows at the start, not when somebody joins.
+    fn open_database(directory: &Path, path: &Path) -> Result<Database, StartError> {
+        let opened = Database::builder().set_cache_size(CACHE_BYTES).create(path);
+        let mut database = opened.map_err(|error| match error {
+            DatabaseError::DatabaseAlreadyOpen => fault(directory, &"another coordinator uses it"),
+            error => fault(path, &error),
+        })?;
+        match database.check_integrity() {
+            Ok(true) => Ok(database),
+            Ok(false) => Err(fault(
+                path,
+                &"was damaged, and is now what it was some changes ago: look at members and tokens after the next start, or \
+                  restore it",
+            )),
+            Err(error) => Err(fault(path, &error)),
+        }
     }
 
     /// Makes the tables, and takes over the epoch of an earlier version.
@@ -130,6 +148,19 @@ impl Store {
             transaction.commit().map_err(broken)
         };
         write().map_err(|error| fault(&self.path, &error))
+    }
+
+    /// Reads everything once.
+    pub(crate) fn read_all(&self) -> Result<(), StartError> {
+        let read = || {
+            self.tokens(0)?;
+            self.members()?;
+            let transaction = self.database.begin_read().map_err(broken)?;
+            let numbers = transaction.open_table(NUMBERS).map_err(broken)?;
+            numbers.get(EPOCH).map_err(broken)?;
+            Ok::<_, StoreError>(())
+        };
+        read().map_err(|error| fault(&self.path, &error))
     }
 
     /// Begins a new life: larger than every earlier one, and durable when this returns.
@@ -359,6 +390,13 @@ fn earlier_epoch(directory: &Path) -> Result<Option<u32>, StartError> {
     }
 }
 
+/// What a panic of the database says.
+fn damage(panic: &(dyn Any + Send)) -> String {
+    let text = panic.downcast_ref::<String>().map(String::as_str);
+    let text = text.or_else(|| panic.downcast_ref::<&str>().copied()).unwrap_or("no message");
+    format!("is damaged; restore it, or remove it if no worker runs ({text})")
+}
+
 fn fault(path: &Path, reason: &dyn ToString) -> StartError {
     StartError::State { path: path.to_owned(), reason: reason.to_string() }
 }
@@ -391,6 +429,40 @@ mod tests {
             let error = Store::open(directory.path()).unwrap_err();
             assert!(error.to_string().contains(EPOCH_FILE), "{garbage:?}: got {error}");
         }
+    }
+
+    #[test]
+    fn a_damaged_file_is_an_error_that_names_it() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join(FILE);
+        drop(Store::open(directory.path()).unwrap());
+        let whole = fs::read(&path).unwrap();
+        let changed = |at: usize| {
+            let mut bytes = whole.clone();
+            bytes[at] ^= 0xff;
+            bytes
+        };
+        // Cut; the layout and the slots in the header; all pages.
+        let mut pages = whole.clone();
+        pages[4_096..].iter_mut().for_each(|byte| *byte ^= 0x55);
+        for (case, bytes) in [
+            ("cut to half", whole[..whole.len() / 2].to_vec()),
+            ("cut to a byte", whole[..1].to_vec()),
+            ("another layout", changed(20)),
+            ("another magic", changed(0)),
+            ("other pages", pages),
+            ("text", b"not a store".to_vec()),
+        ] {
+            fs::write(&path, bytes).unwrap();
+            let error = Store::open(directory.path()).map(drop).expect_err(case).to_string();
+            assert!(error.contains(FILE), "{case}: {error}");
+        }
+        fs::write(&path, &whole).unwrap();
+        assert_eq!(
+            Store::open(directory.path()).unwrap().begin_epoch().unwrap(),
+            Epoch(1),
+            "it was the file"
+        );
     }
 
     #[test]

@@ -25,10 +25,12 @@ mod executor;
 mod real;
 mod sim;
 mod spec;
+mod text;
 
 pub use self::{
     error::{Busy, OpenError},
     executor::{Executor, ExecutorConfig, ExecutorEvent, Host, HungDevice, Order, expand},
     real::{Adapter, enumerate},
     spec::{DeviceSpec, SimSpec, SpecError},
+    text::{TextError, check_module},
 };

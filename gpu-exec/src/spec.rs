@@ -4,6 +4,9 @@ use std::{fmt, str::FromStr};
 
 use thiserror::Error;
 
+/// Longest value, in bytes: errors repeat it.
+const MAX_SPEC_BYTES: usize = 256;
+
 /// Which device, or devices, to open.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum DeviceSpec {
@@ -38,6 +41,9 @@ pub enum SpecError {
     /// The word is none of the four.
     #[error("device `{0}`: expected all, gpu:N, cpu or sim[:score=S,speed=V]")]
     UnknownKind(String),
+    /// Longer than any device's name; the text is its start.
+    #[error("device `{0}...`: a value of more than {MAX_SPEC_BYTES} B")]
+    TooLong(String),
     /// `gpu:` without a number.
     #[error("device `{spec}`: `{value}` is no GPU number (expected gpu:0, gpu:1, ...)")]
     GpuIndex {
@@ -78,6 +84,9 @@ impl FromStr for DeviceSpec {
     type Err = SpecError;
 
     fn from_str(text: &str) -> Result<Self, SpecError> {
+        if text.len() > MAX_SPEC_BYTES {
+            return Err(SpecError::TooLong(text.chars().take(MAX_SPEC_BYTES / 8).collect()));
+        }
         let (kind, rest) = text.split_once(':').map_or((text, None), |(kind, rest)| (kind, Some(rest)));
         match (kind, rest) {
             ("all", None) => Ok(Self::All),

@@ -171,35 +171,46 @@ pub(crate) struct Row {
     pub(crate) symbols: Vec<u8>,
 }
 
+/// Longest piece of a name that an error repeats, in characters.
+const EXCERPT_CHARS: usize = 60;
+
+/// The start of a name.
+fn excerpt(name: &str) -> String {
+    match name.char_indices().nth(EXCERPT_CHARS) {
+        Some((end, _)) => format!("{}...", &name[..end]),
+        None => name.to_owned(),
+    }
+}
+
 impl Alignment {
     /// Checks rows of one format and turns them into columns of codes.
     pub(crate) fn from_rows(rows: Vec<Row>, format: &'static str) -> Result<Self, AlignmentError> {
         let first = rows.first().ok_or(AlignmentError::Empty)?;
         let (n, l) = (rows.len(), first.symbols.len());
         if n == 1 {
-            return Err(AlignmentError::OneSequence { line: first.line, name: first.name.clone() });
+            return Err(AlignmentError::OneSequence { line: first.line, name: excerpt(&first.name) });
         }
         if let Some(row) = rows.get(MAX_ROWS) {
             return Err(AlignmentError::TooManyRows { line: row.line, limit: MAX_ROWS });
         }
         for row in &rows {
             if row.symbols.is_empty() {
-                return Err(AlignmentError::EmptySequence { line: row.line, name: row.name.clone() });
+                return Err(AlignmentError::EmptySequence { line: row.line, name: excerpt(&row.name) });
             }
             if row.symbols.len() != l {
                 return Err(AlignmentError::UnequalLengths {
                     line: row.line,
-                    name: row.name.clone(),
+                    name: excerpt(&row.name),
                     length: row.symbols.len(),
                     first_line: first.line,
-                    first_name: first.name.clone(),
+                    first_name: excerpt(&first.name),
                     first_length: l,
                     format,
                 });
             }
         }
         if l > MAX_COLUMNS {
-            let (line, name) = (first.line, first.name.clone());
+            let (line, name) = (first.line, excerpt(&first.name));
             return Err(AlignmentError::TooManyColumns { line, name, length: l, limit: MAX_COLUMNS });
         }
         let mut symbols = vec![0_u8; n * l];

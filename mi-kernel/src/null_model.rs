@@ -31,6 +31,16 @@ pub enum NullModelError {
         /// Which.
         iteration: u64,
     },
+    /// No iterations make such sums: they were damaged, or made up.
+    #[error("pair ({i}, {j}): no {iterations} iterations have these sums")]
+    Impossible {
+        /// First column.
+        i: usize,
+        /// Second column.
+        j: usize,
+        /// Iterations that they are said to be of.
+        iterations: usize,
+    },
     /// Sums of different alignments.
     #[error("sums over {ours} pairs cannot take sums over {theirs}")]
     Pairs {
@@ -122,7 +132,7 @@ impl Accumulators {
     /// Sums as a job returns them or a file keeps them; `maxima` says which iterations they are of.
     ///
     /// # Errors
-    /// A part has another number of pairs than `l` columns make.
+    /// A part has another number of pairs than `l` columns make, or no iterations make such sums.
     pub fn from_parts(
         l: usize,
         sum: Vec<i64>,
@@ -136,7 +146,14 @@ impl Accumulators {
                 return Err(NullModelError::Pairs { ours: pairs, theirs: length });
             }
         }
-        Ok(Self { l, sum, sum_of_squares, at_least_observed, maxima })
+        let sums = Self { l, sum, sum_of_squares, at_least_observed, maxima };
+        match (0..pairs).find(|place| !sums.is_possible(*place)) {
+            None => Ok(sums),
+            Some(place) => {
+                let pair = sums.pair(place);
+                Err(NullModelError::Impossible { i: pair.i, j: pair.j, iterations: sums.iterations() })
+            }
+        }
     }
 
     /// Adds one iteration's scores.
@@ -273,8 +290,21 @@ impl Accumulators {
         Ok(())
     }
 
+    /// Cauchy-Schwarz: (sum of X)^2 <= iterations * (sum of X^2). [`moments`] takes the root of the difference.
+    fn is_possible(&self, place: usize) -> bool {
+        let runs = self.iterations() as u128;
+        let square = u128::from(self.sum[place].unsigned_abs()).pow(2);
+        square <= u128::from(self.sum_of_squares[place]) * runs
+            && (runs > 0 || self.sum_of_squares[place] == 0)
+            && u128::from(self.at_least_observed[place]) <= runs
+    }
+
+    fn pair(&self, place: usize) -> PairIndex {
+        PairIndex::all(self.l).nth(place).expect("the place is of a pair")
+    }
+
     fn overflow(&self, place: usize) -> NullModelError {
-        let pair = PairIndex::all(self.l).nth(place).expect("the place is of a pair");
+        let pair = self.pair(place);
         NullModelError::Overflow { i: pair.i, j: pair.j, iterations: self.iterations() }
     }
 }
@@ -333,6 +363,26 @@ mod tests {
         assert_eq!(sums.merge(copy), Err(NullModelError::Doubled { iteration: 4 }));
         assert_eq!(sums.merge(Accumulators::new(3)), Err(NullModelError::Pairs { ours: 1, theirs: 3 }));
         assert_eq!((sums.iterations(), sums.at_least_observed()), (1, &[1][..]));
+    }
+
+    #[test]
+    fn sums_that_no_iterations_have_are_refused_by_their_pair() {
+        let of = |sum, squares, reached, runs: u64| {
+            let maxima = (0..runs).map(|iteration| (iteration, 0)).collect();
+            Accumulators::from_parts(3, vec![0, sum, 0], vec![0, squares, 0], vec![0, reached, 0], maxima)
+        };
+        assert!(of(6, 12, 3, 3).is_ok(), "2 three times");
+        assert!(of(i64::MIN, u64::MAX, 0, 1 << 20).is_ok(), "the largest sums that fit");
+        for (case, (sum, squares, reached, runs)) in [
+            ("a sum without squares", (7, 12, 0, 3)),
+            ("a sum below", (-7, 12, 0, 3)),
+            ("squares of no iteration", (0, 1, 0, 0)),
+            ("reached too often", (6, 12, 4, 3)),
+        ] {
+            let error = of(sum, squares, reached, runs).unwrap_err();
+            let iterations = usize::try_from(runs).unwrap();
+            assert_eq!(error, NullModelError::Impossible { i: 0, j: 2, iterations }, "{case}");
+        }
     }
 
     #[test]

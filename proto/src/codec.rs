@@ -172,17 +172,20 @@ fn encode_into<T: Serialize>(
 
 fn decode<T: DeserializeOwned>(what: &'static str, bytes: &[u8], cap: usize) -> Result<T, CodecError> {
     // bincode's limit counts what is claimed in memory, not what is read: a one-byte varint claims eight. Sixteen times
-    // the input is enough for every honest value; the limit is a constant of the type, so the next step up is taken.
+    // the input is enough for every honest value; the limit is a constant of the type, so the next power of four is taken.
     if bytes.len() > cap {
-        Err(too_large(what, bytes.len(), cap))
-    } else if bytes.len() <= 4 << 10 {
-        decode_within::<T, { 64 << 10 }>(what, bytes)
-    } else if bytes.len() <= 256 << 10 {
-        decode_within::<T, { 4 << 20 }>(what, bytes)
-    } else if bytes.len() <= 16 << 20 {
-        decode_within::<T, { 256 << 20 }>(what, bytes)
-    } else {
-        decode_within::<T, { 4 << 30 }>(what, bytes)
+        return Err(too_large(what, bytes.len(), cap));
+    }
+    match bytes.len() {
+        0..=0x1000 => decode_within::<T, { 64 << 10 }>(what, bytes),
+        0x1001..=0x4000 => decode_within::<T, { 256 << 10 }>(what, bytes),
+        0x4001..=0x1_0000 => decode_within::<T, { 1 << 20 }>(what, bytes),
+        0x1_0001..=0x4_0000 => decode_within::<T, { 4 << 20 }>(what, bytes),
+        0x4_0001..=0x10_0000 => decode_within::<T, { 16 << 20 }>(what, bytes),
+        0x10_0001..=0x40_0000 => decode_within::<T, { 64 << 20 }>(what, bytes),
+        0x40_0001..=0x100_0000 => decode_within::<T, { 256 << 20 }>(what, bytes),
+        0x100_0001..=0x400_0000 => decode_within::<T, { 1 << 30 }>(what, bytes),
+        _ => decode_within::<T, { 4 << 30 }>(what, bytes),
     }
 }
 

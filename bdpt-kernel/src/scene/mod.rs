@@ -27,7 +27,7 @@ use self::{
     mtl::Library,
     obj::Geometry,
     scan::{MAX_TRIANGLES, UsedMaterial},
-    source::{Source, path_inside},
+    source::{Source, excerpt, path_inside},
     surface::{GREY, Surface},
     toml::{DescribedMaterial, Description},
 };
@@ -41,6 +41,10 @@ const MAX_DESCRIPTION_BYTES: u64 = 16 << 20;
 const MAX_GEOMETRY_BYTES: u64 = 8 << 30;
 /// Largest MTL file.
 const MAX_LIBRARY_BYTES: u64 = 64 << 20;
+/// Longest name of a file in a scene's files, in bytes: Linux' `PATH_MAX`.
+const MAX_PATH_BYTES: usize = 4_096;
+/// Most materials of all geometry files together. A file can be named again and again, and each time brings its materials.
+const MAX_MATERIALS: usize = 1 << 20;
 /// Most warnings kept; further ones are counted.
 const MAX_WARNINGS: usize = 500;
 
@@ -171,14 +175,20 @@ impl Loader<'_> {
         geometry.warnings.drain(..).for_each(|warning| report.warn(warning));
 
         let libraries = self.libraries(&source, &geometry.libraries)?;
-        let first = u32::try_from(self.scene.materials.len()).expect("bounded by lines of text");
+        let too_many = |what, most| {
+            let fault = GeometryFault::TooMany { what, most };
+            SceneError::Geometry { place: place.clone(), object: None, fault }
+        };
+        if self.scene.materials.len() + geometry.materials.len() > MAX_MATERIALS {
+            return Err(too_many("materials", MAX_MATERIALS));
+        }
+        let first = u32::try_from(self.scene.materials.len()).expect("bounded by MAX_MATERIALS");
         for used in &geometry.materials {
             let material = self.material(&source, used, libraries.as_ref())?;
             self.scene.materials.push(material);
         }
         if self.scene.triangles.len() + geometry.triangles.len() > MAX_TRIANGLES {
-            let fault = GeometryFault::TooMany { what: "triangles", most: MAX_TRIANGLES };
-            return Err(SceneError::Geometry { place: place.clone(), object: None, fault });
+            return Err(too_many("triangles", MAX_TRIANGLES));
         }
         geometry.triangles.iter_mut().for_each(|triangle| triangle.material += first);
         if self.scene.triangles.is_empty() {
@@ -243,7 +253,7 @@ impl Loader<'_> {
             (None, Some(_)) => Err(SceneError::UnknownMaterial {
                 place,
                 object: used.object.clone(),
-                material: name.clone(),
+                material: excerpt(name),
             }),
         }
     }
@@ -273,10 +283,14 @@ impl Loader<'_> {
 
 /// The path of a file that another one names: inside the folder, and there.
 fn inside(folder: &Path, name: &str, place: &Place, what: &'static str) -> Result<PathBuf, SceneError> {
-    let (name, place) = (name.to_owned(), place.clone());
-    match path_inside(folder, &name) {
-        None => Err(SceneError::Outside { place, what, name }),
-        Some(tried) if !tried.exists() => Err(SceneError::Missing { place, what, name, tried }),
+    let (shown, place) = (excerpt(name), place.clone());
+    match path_inside(folder, name) {
+        None => Err(SceneError::Outside { place, what, name: shown }),
+        // No system has such a file, and no error should repeat its name.
+        Some(_) if name.len() > MAX_PATH_BYTES => {
+            Err(SceneError::Missing { place, what, name: shown, tried: folder.to_owned() })
+        }
+        Some(tried) if !tried.exists() => Err(SceneError::Missing { place, what, name: shown, tried }),
         Some(path) => Ok(path),
     }
 }

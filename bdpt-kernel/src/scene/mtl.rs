@@ -118,7 +118,7 @@ impl Library {
 }
 
 fn fault(source: &Source, line: usize, material: Option<&str>, fault: impl Into<String>) -> SceneError {
-    let material = material.map(ToOwned::to_owned);
+    let material = material.map(excerpt);
     SceneError::MaterialLibrary { place: source.line(line), material, fault: fault.into() }
 }
 

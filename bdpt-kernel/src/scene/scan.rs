@@ -50,7 +50,7 @@ pub(crate) struct UsedMaterial {
     pub(crate) name: Option<String>,
     /// Line of the first `usemtl`, or of the first face.
     pub(crate) line: usize,
-    /// Object or group there.
+    /// Start of the name of the object or group there.
     pub(crate) object: Option<String>,
 }
 
@@ -117,8 +117,7 @@ impl<'a> Scan<'a> {
     }
 
     fn fault(&self, fault: GeometryFault) -> SceneError {
-        let object = self.object.map(ToOwned::to_owned);
-        SceneError::Geometry { place: self.source.line(self.line), object, fault }
+        SceneError::Geometry { place: self.source.line(self.line), object: self.object.map(excerpt), fault }
     }
 
     fn read(&mut self, text: &'a str) -> Result<(), SceneError> {
@@ -299,7 +298,9 @@ impl<'a> Scan<'a> {
         }
         if self.names.insert(name) {
             let line = self.current.map_or(self.line, |(_, line)| line);
-            let (name, object) = (name.map(ToOwned::to_owned), self.object.map(ToOwned::to_owned));
+            // The name of an object is for errors only. In full it would be kept once for each of its materials: gigabytes for
+            // a name of a megabyte and a thousand `usemtl`.
+            let (name, object) = (name.map(ToOwned::to_owned), self.object.map(excerpt));
             self.checked.materials.push(UsedMaterial { name, line, object });
         }
     }

@@ -88,7 +88,12 @@ pub(crate) fn path_inside(folder: &Path, name: &str) -> Option<PathBuf> {
 
 /// The start of a piece of text.
 pub(crate) fn excerpt(text: &str) -> String {
-    match text.char_indices().nth(EXCERPT_CHARS) {
+    shortened(text, EXCERPT_CHARS)
+}
+
+/// The first `most` characters of a text.
+pub(crate) fn shortened(text: &str, most: usize) -> String {
+    match text.char_indices().nth(most) {
         Some((end, _)) => format!("{}...", &text[..end]),
         None => text.to_owned(),
     }
@@ -109,6 +114,12 @@ mod tests {
         {
             assert_eq!(path_inside(folder, bad), None, "{bad}");
         }
+    }
+
+    #[test]
+    fn excerpts_are_short() {
+        assert_eq!(shortened("äöü", 3), "äöü");
+        assert_eq!(shortened("äöüß", 3), "äöü...");
     }
 
     #[test]

@@ -9,7 +9,7 @@ use toml::Spanned;
 use super::{
     error::{Place, SceneError},
     model::{Bsdf, Camera, FilmSize, IOR_RANGE, MAX_COORDINATE, MAX_RADIANCE},
-    source::Source,
+    source::{Source, excerpt, shortened},
     surface::{GREY, Surface, normal_incidence},
 };
 
@@ -25,6 +25,9 @@ pub(crate) struct Description {
     pub(crate) materials: BTreeMap<String, DescribedMaterial>,
 }
 
+/// Longest message of the TOML parser that an error repeats, in characters.
+const MAX_REASON_CHARS: usize = 500;
+
 /// An entry of `[materials]`.
 #[derive(Debug)]
 pub(crate) struct DescribedMaterial {
@@ -37,7 +40,7 @@ impl Description {
     pub(crate) fn parse(source: &Source) -> Result<Self, SceneError> {
         let raw: Result<RawScene, _> =
             toml::from_str(&source.text).map_err(|error| description_error(source, error));
-        let check = Check { source };
+        let check = Check::new(source);
         // Whatever else is wrong, and with whatever keys: a light cannot be rendered.
         if let Ok(Lights { light: Some(light) }) = toml::from_str(&source.text)
             && !raw.as_ref().is_ok_and(|raw| raw.light.is_empty())
@@ -68,9 +71,9 @@ impl Description {
 
 fn description_error(source: &Source, mut error: toml::de::Error) -> SceneError {
     let place = error.span().map(|span| source.offset(span.start));
-    // Without its input the error prints as one message and the key's path; the line is ours to show.
+    // It may name a key, however long. Without its input the error prints as one message and the key's path; the line is ours to show.
     error.set_input(None);
-    let reason = error.to_string().trim().replace('\n', " ");
+    let reason = shortened(&error.to_string(), MAX_REASON_CHARS).trim().replace('\n', " ");
     match place {
         None => SceneError::Description { place: Place { file: source.path.clone(), line: None }, reason },
         Some(place) => {
@@ -171,11 +174,23 @@ struct RawMaterial {
 /// Checks values and words what is wrong with them.
 struct Check<'a> {
     source: &'a Source,
+    /// Offset of each line's first byte. Each file and material has a place: counting lines anew for each would take an hour for
+    /// the largest file.
+    line_starts: Vec<usize>,
 }
 
-impl Check<'_> {
+impl<'a> Check<'a> {
+    fn new(source: &'a Source) -> Self {
+        let ends = source.text.bytes().enumerate().filter(|(_, byte)| *byte == b'\n');
+        Self { source, line_starts: std::iter::once(0).chain(ends.map(|(at, _)| at + 1)).collect() }
+    }
+
     fn place<T>(&self, value: &Spanned<T>) -> Place {
-        self.source.offset(value.span().start)
+        self.place_of(value.span().start)
+    }
+
+    fn place_of(&self, offset: usize) -> Place {
+        self.source.line(self.line_starts.partition_point(|start| *start <= offset))
     }
 
     fn wrong<T>(&self, value: &Spanned<T>, key: &str, reason: impl Into<String>) -> SceneError {
@@ -339,7 +354,7 @@ impl Check<'_> {
                 (needed, [("light.position", &light.position), ("light.intensity", &light.intensity)])
             }
             kind => {
-                let reason = format!("unknown type \"{kind}\": point or directional");
+                let reason = format!("unknown type \"{}\": point or directional", excerpt(kind));
                 return self.wrong(&light.kind, "light.type", reason);
             }
         };
@@ -363,7 +378,7 @@ impl Check<'_> {
     }
 
     fn material(&self, name: &str, raw: &RawMaterial) -> Result<Surface, SceneError> {
-        let key = |key: &str| format!("materials.\"{name}\".{key}");
+        let key = |key: &str| format!("materials.\"{}\".{key}", excerpt(name));
         let kind = raw.kind.get_ref().as_str();
         let allowed: &[&str] = match kind {
             "diffuse" | "mirror" => &["reflectance"],
@@ -374,8 +389,9 @@ impl Check<'_> {
             "ashikhmin_shirley" => &["reflectance", "specular", "alpha", "alpha_u", "alpha_v"],
             unknown => {
                 let reason = format!(
-                    "unknown type \"{unknown}\": diffuse, ashikhmin_shirley, conductor, rough_conductor, mirror, \
-                     dielectric or rough_dielectric"
+                    "unknown type \"{}\": diffuse, ashikhmin_shirley, conductor, rough_conductor, mirror, dielectric or \
+                     rough_dielectric",
+                    excerpt(unknown)
                 );
                 return Err(self.wrong(&raw.kind, &key("type"), reason));
             }
@@ -433,11 +449,7 @@ impl Check<'_> {
             if let (Some(span), false) = (span, allowed.contains(&name)) {
                 let reason =
                     format!("does not belong to type \"{kind}\" (which takes {})", allowed.join(", "));
-                return Err(SceneError::Value {
-                    place: self.source.offset(span.start),
-                    key: key(name),
-                    reason,
-                });
+                return Err(SceneError::Value { place: self.place_of(span.start), key: key(name), reason });
             }
         }
         Ok(())
@@ -467,7 +479,8 @@ impl Check<'_> {
         if let Some(distribution) = &raw.distribution
             && !["ggx", "beckmann"].contains(&distribution.get_ref().as_str())
         {
-            let reason = format!("unknown distribution \"{}\": ggx or beckmann", distribution.get_ref());
+            let reason =
+                format!("unknown distribution \"{}\": ggx or beckmann", excerpt(distribution.get_ref()));
             return Err(self.wrong(distribution, &key("distribution"), reason));
         }
         for (name, value) in [("alpha", &raw.alpha), ("alpha_u", &raw.alpha_u), ("alpha_v", &raw.alpha_v)] {

@@ -28,7 +28,7 @@ pub mod v1;
 pub use self::{
     convert::{
         MAX_ADDRESSES, MAX_CERTIFICATE_BYTES, MAX_CONTENTS, MAX_ENTRIES, MAX_JOBS, MAX_NAME_BYTES,
-        MAX_TEXT_BYTES, WireError, eviction,
+        MAX_TEXT_BYTES, MessageError, WireError, decode, encode, eviction,
     },
     incoming::Incoming,
     session::{

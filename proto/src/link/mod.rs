@@ -30,6 +30,7 @@ pub use self::{
     fetch::{FetchError, STALL_TIMEOUT},
     receive::LinkReceiver,
     send::{LinkSender, TrySendError},
+    wire::{decode_frames, encode_frame},
 };
 use crate::codec::CodecError;
 

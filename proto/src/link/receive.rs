@@ -15,9 +15,8 @@ use tokio::sync::{mpsc, watch};
 use super::{
     Frame, Header, LinkError, MAX_PAYLOAD_BYTES, QUEUED_FRAMES, SMALL_PAYLOAD_BYTES,
     shared::{Guard, Shared},
-    wire::{self, Lengths, PREFIX_BYTES, protocol},
+    wire::{self, Lengths, PREFIX_BYTES, protocol, split_frame},
 };
-use crate::codec;
 
 /// Chunks taken from the network at once.
 const READ_CHUNKS: usize = 32;
@@ -209,19 +208,6 @@ async fn read_bulk<R: Header>(inbox: &Inbox<R>, mut input: Input) -> Result<(), 
         return Err(protocol("bytes follow the frame of a bulk stream".to_owned()).into());
     }
     inbox.bulk.send(frame).await.map_err(|_| Stop::Over)
-}
-
-/// Takes a complete frame from the front of `buffer`; its payload shares the buffer's memory.
-fn split_frame<R: Header>(buffer: &mut BytesMut, lengths: Lengths) -> Result<Frame<R>, LinkError> {
-    buffer.advance(PREFIX_BYTES);
-    let header =
-        codec::decode_header(&buffer[..lengths.header]).map_err(|error| protocol(error.to_string()))?;
-    buffer.advance(lengths.header);
-    let payload = match lengths.payload {
-        0 => Bytes::new(),
-        payload => buffer.split_to(payload).freeze(),
-    };
-    Ok(Frame { header, payload })
 }
 
 /// A stream and the chunks read from it but not yet consumed.

@@ -1,9 +1,9 @@
 //! The layout of a frame: `u32` header length, `u64` payload length (both little-endian), header, payload.
 //! Each one-way stream begins with one byte that says what follows on it.
 
-use bytes::{BufMut, Bytes, BytesMut};
+use bytes::{Buf as _, BufMut, Bytes, BytesMut};
 
-use super::{Header, LinkError, MAX_PAYLOAD_BYTES};
+use super::{Frame, Header, LinkError, MAX_PAYLOAD_BYTES};
 use crate::codec::{self, CodecError, MAX_HEADER_BYTES};
 
 /// First byte of the one stream of small frames.
@@ -12,6 +12,33 @@ pub(super) const ORDERED_STREAM: u8 = 0;
 pub(super) const BULK_STREAM: u8 = 1;
 /// Bytes of the two lengths.
 pub(super) const PREFIX_BYTES: usize = 12;
+
+/// A frame as it travels.
+///
+/// # Errors
+/// The header is over its cap.
+pub fn encode_frame<S: Header>(header: &S, payload: &[Bytes]) -> Result<Bytes, CodecError> {
+    let mut buffer = BytesMut::new();
+    append_header(&mut buffer, header, payload)?;
+    payload.iter().for_each(|chunk| buffer.extend_from_slice(chunk));
+    Ok(buffer.freeze())
+}
+
+/// The frames in the bytes of a stream, as a link reads them, without a network; a frame that is not all there is left out.
+///
+/// # Errors
+/// A length is over its cap, or a header is not one.
+pub fn decode_frames<R: Header>(bytes: Bytes) -> Result<Vec<Frame<R>>, LinkError> {
+    let mut buffer = BytesMut::from(bytes);
+    let mut frames = Vec::new();
+    while let Some(lengths) = Lengths::parse(&buffer, MAX_PAYLOAD_BYTES)? {
+        if buffer.len() < lengths.frame_bytes() {
+            break;
+        }
+        frames.push(split_frame(&mut buffer, lengths)?);
+    }
+    Ok(frames)
+}
 
 /// The checked lengths of a frame.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -57,6 +84,19 @@ pub(super) fn append_header<S: Header>(
     let header_bytes = u32::try_from(header_bytes).expect("the codec caps headers at 16 MiB");
     buffer[start..start + 4].copy_from_slice(&header_bytes.to_le_bytes());
     Ok(())
+}
+
+/// Takes a complete frame from the front of `buffer`; its payload shares the buffer's memory.
+pub(super) fn split_frame<R: Header>(buffer: &mut BytesMut, lengths: Lengths) -> Result<Frame<R>, LinkError> {
+    buffer.advance(PREFIX_BYTES);
+    let header =
+        codec::decode_header(&buffer[..lengths.header]).map_err(|error| protocol(error.to_string()))?;
+    buffer.advance(lengths.header);
+    let payload = match lengths.payload {
+        0 => Bytes::new(),
+        payload => buffer.split_to(payload).freeze(),
+    };
+    Ok(Frame { header, payload })
 }
 
 pub(super) fn protocol(reason: String) -> LinkError {

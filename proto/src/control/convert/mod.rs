@@ -10,6 +10,7 @@ mod timeline;
 
 pub use self::admin::eviction;
 use farm_core::id::DeviceIndex;
+use prost::Message;
 use thiserror::Error;
 
 /// Most jobs named by one message (16 bytes each at worst: within the message cap).
@@ -54,6 +55,33 @@ pub enum WireError {
         /// The most allowed.
         cap: usize,
     },
+}
+
+/// Why bytes are not a message. Not to be retried.
+#[derive(Clone, Debug, PartialEq, Eq, Error)]
+pub enum MessageError {
+    /// They are no message of this shape.
+    #[error("a message does not decode: {0}")]
+    Malformed(#[from] prost::DecodeError),
+    /// The message says what the protocol does not allow.
+    #[error(transparent)]
+    Refused(#[from] WireError),
+}
+
+/// A message's bytes, as a session carries them.
+#[must_use]
+pub fn encode<W: Message + From<D>, D>(message: D) -> Vec<u8> {
+    W::from(message).encode_to_vec()
+}
+
+/// A message from its bytes, as a session hears it: what gRPC does to each, without a network.
+///
+/// # Errors
+/// They are no message, or it says what the protocol does not allow.
+pub fn decode<W: Message + Default, D: TryFrom<W, Error = WireError>>(
+    bytes: &[u8],
+) -> Result<D, MessageError> {
+    Ok(D::try_from(W::decode(bytes)?)?)
 }
 
 fn required<T>(field: &'static str, value: Option<T>) -> Result<T, WireError> {
