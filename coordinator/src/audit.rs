@@ -10,6 +10,7 @@ use std::{
     time::{Duration, Instant, SystemTime},
 };
 
+use proto::trust::unix_seconds;
 use serde_json::{Value, json};
 
 /// The log, and the one before it.
@@ -48,7 +49,7 @@ impl Audit {
     /// Something was done; it is on disk when this returns.
     pub(crate) fn done(&self, what: &str, who: &str, details: Value) {
         let mut log = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        log.append(&json!({ "time_s": now_s(), "event": what, "who": who, "details": details }), true);
+        log.append(&json!({ "time_s": unix_seconds(SystemTime::now()), "event": what, "who": who, "details": details }), true);
     }
 
     /// Something was refused.
@@ -58,14 +59,13 @@ impl Audit {
             let unwritten = log.refusals.saturating_sub(REFUSALS_PER_SECOND);
             (log.second, log.refusals) = (Instant::now(), 0);
             if unwritten > 0 {
-                log.append(&json!({ "time_s": now_s(), "event": "refused", "unwritten": unwritten }), false);
+                log.append(&json!({ "time_s": unix_seconds(SystemTime::now()), "event": "refused", "unwritten": unwritten }), false);
             }
         }
         log.refusals += 1;
         if log.refusals <= REFUSALS_PER_SECOND {
             let reason = reason.chars().take(MAX_REASON_CHARS).collect::<String>();
-            let line =
-                json!({ "time_s": now_s(), "event": "refused", "what": what, "who": who, "reason": reason });
+            let line = json!({ "time_s": unix_seconds(SystemTime::now()), "event": "refused", "what": what, "who": who, "reason": reason });
             log.append(&line, false);
         }
     }
@@ -98,10 +98,6 @@ fn open(directory: &Path) -> io::Result<(File, u64)> {
     let file = OpenOptions::new().create(true).append(true).mode(0o600).open(directory.join(FILE))?;
     let bytes = file.metadata()?.len();
     Ok((file, bytes))
-}
-
-fn now_s() -> u64 {
-    SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default().as_secs()
 }
 
 #[cfg(test)]

@@ -8,16 +8,15 @@ use std::sync::Arc;
 
 use quinn::crypto::rustls::{QuicClientConfig, QuicServerConfig};
 use rustls::{
-    CertificateError, DigitallySignedStruct, Error, SignatureScheme,
-    client::danger::{HandshakeSignatureValid, ServerCertVerified, ServerCertVerifier},
-    crypto::{CryptoProvider, WebPkiSupportedAlgorithms, ring, verify_tls13_signature},
-    pki_types::{CertificateDer, PrivateKeyDer, ServerName, UnixTime},
+    Error,
+    crypto::{CryptoProvider, ring},
+    pki_types::{CertificateDer, PrivateKeyDer},
 };
 use thiserror::Error;
 
 use crate::trust::{
     Identity, Member,
-    verify::{CoordinatorCheck, MemberCheck},
+    verify::{MemberCheck, ServerCheck},
 };
 
 /// What both ends of the data plane must speak; a peer of another protocol is refused in the handshake.
@@ -88,12 +87,8 @@ pub(crate) fn pinned_client_config(
     certificate_der: &[u8],
     identity: Option<&Identity>,
 ) -> Result<QuicClientConfig, TlsError> {
-    let provider = provider();
-    let verifier = PinnedCertificate {
-        expected: CertificateDer::from(certificate_der.to_vec()),
-        algorithms: provider.signature_verification_algorithms,
-    };
-    let mut config = client_config(Arc::new(verifier), identity)?;
+    let check = ServerCheck::Pinned(CertificateDer::from(certificate_der.to_vec()));
+    let mut config = client_config(check, identity)?;
     config.alpn_protocols = vec![ALPN.to_vec()];
     QuicClientConfig::try_from(config).map_err(|error| TlsError::Configuration(error.to_string()))
 }
@@ -113,33 +108,27 @@ pub(crate) fn control_server_config(identity: &Identity) -> Result<rustls::Serve
 
 /// A member's side of the control plane.
 pub(crate) fn control_client_config(identity: &Identity) -> Result<rustls::ClientConfig, TlsError> {
-    let check = CoordinatorCheck::Authority(identity.authority().clone());
+    let check = ServerCheck::Authority(identity.authority().clone());
     control_client(check, Some(identity))
 }
 
 /// The side of who joins: it knows the coordinator by the blake3 of the farm's authority.
 pub(crate) fn join_client_config(authority: [u8; 32]) -> Result<rustls::ClientConfig, TlsError> {
-    control_client(CoordinatorCheck::Fingerprint(authority), None)
+    control_client(ServerCheck::Fingerprint(authority), None)
 }
 
-fn control_client(
-    check: CoordinatorCheck,
-    identity: Option<&Identity>,
-) -> Result<rustls::ClientConfig, TlsError> {
-    let mut config = client_config(Arc::new(check), identity)?;
+fn control_client(check: ServerCheck, identity: Option<&Identity>) -> Result<rustls::ClientConfig, TlsError> {
+    let mut config = client_config(check, identity)?;
     config.alpn_protocols = vec![HTTP_2.to_vec()];
     Ok(config)
 }
 
-fn client_config(
-    verifier: Arc<dyn ServerCertVerifier>,
-    identity: Option<&Identity>,
-) -> Result<rustls::ClientConfig, TlsError> {
+fn client_config(check: ServerCheck, identity: Option<&Identity>) -> Result<rustls::ClientConfig, TlsError> {
     let builder = rustls::ClientConfig::builder_with_provider(provider())
         .with_protocol_versions(&[&rustls::version::TLS13])
         .map_err(configuration)?
         .dangerous()
-        .with_custom_certificate_verifier(verifier);
+        .with_custom_certificate_verifier(Arc::new(check));
     let mut config = match identity {
         Some(identity) => builder.with_client_cert_resolver(Arc::new(identity.clone())),
         None => builder.with_no_client_auth(),
@@ -156,52 +145,6 @@ fn members(identity: &Identity, mandatory: bool) -> Arc<MemberCheck> {
 /// Whose certificate a peer has shown; the handshake has checked that it is a member's.
 pub(crate) fn member(shown: Option<&[CertificateDer<'_>]>) -> Option<Member> {
     Member::of_certificate(shown?.first()?).ok()
-}
-
-/// Accepts exactly one certificate, and only from who holds its key.
-#[derive(Debug)]
-struct PinnedCertificate {
-    expected: CertificateDer<'static>,
-    algorithms: WebPkiSupportedAlgorithms,
-}
-
-impl ServerCertVerifier for PinnedCertificate {
-    fn verify_server_cert(
-        &self,
-        end_entity: &CertificateDer<'_>,
-        _intermediates: &[CertificateDer<'_>],
-        _server_name: &ServerName<'_>,
-        _ocsp_response: &[u8],
-        _now: UnixTime,
-    ) -> Result<ServerCertVerified, Error> {
-        if *end_entity == self.expected {
-            Ok(ServerCertVerified::assertion())
-        } else {
-            Err(Error::InvalidCertificate(CertificateError::ApplicationVerificationFailure))
-        }
-    }
-
-    fn verify_tls12_signature(
-        &self,
-        _message: &[u8],
-        _certificate: &CertificateDer<'_>,
-        _signature: &DigitallySignedStruct,
-    ) -> Result<HandshakeSignatureValid, Error> {
-        Err(Error::General("TLS 1.2 is not spoken here".to_owned()))
-    }
-
-    fn verify_tls13_signature(
-        &self,
-        message: &[u8],
-        certificate: &CertificateDer<'_>,
-        signature: &DigitallySignedStruct,
-    ) -> Result<HandshakeSignatureValid, Error> {
-        verify_tls13_signature(message, certificate, signature, &self.algorithms)
-    }
-
-    fn supported_verify_schemes(&self) -> Vec<SignatureScheme> {
-        self.algorithms.supported_schemes()
-    }
 }
 
 fn provider() -> Arc<CryptoProvider> {

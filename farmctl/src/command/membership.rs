@@ -10,7 +10,7 @@ use std::{
 use anyhow::{Context as _, anyhow};
 use proto::{
     control::{self, Invitation, v1::TokenStatus},
-    trust::{Identity, JoinToken, Role, check_name},
+    trust::{Identity, JoinToken, Role, check_name, unix_seconds},
 };
 use serde_json::{Value, json};
 
@@ -157,7 +157,7 @@ pub(crate) async fn token(verb: &TokenVerb, target: &Target<'_>, format: Format)
                 "token": token.to_string(),
                 "role": role.to_string(),
                 "name": name,
-                "expires_s": now_s() + expires.as_secs(),
+                "expires_s": unix_seconds(SystemTime::now()) + expires.as_secs(),
                 "uses": uses,
             });
             // The token alone: scripts take it as it is.
@@ -192,7 +192,8 @@ fn tokens_table(tokens: &[Value]) -> String {
     let text = |value: &Value| value.as_str().map_or_else(String::new, printable);
     let mut table = output::table(["TOKEN", "ROLE", "NAME", "EXPIRES IN", "USES LEFT", "MADE BY"]);
     for token in tokens {
-        let seconds = token["expires_s"].as_u64().unwrap_or(0).saturating_sub(now_s());
+        let seconds =
+            token["expires_s"].as_u64().unwrap_or(0).saturating_sub(unix_seconds(SystemTime::now()));
         let minutes = Duration::from_secs(seconds).as_secs().div_ceil(60);
         table.add_row([
             token["id"].to_string(),
@@ -221,8 +222,4 @@ pub(crate) async fn member(verb: &MemberVerb, target: &Target<'_>, format: Forma
             output::print_text(&format!("{} is no member any more\n", printable(member)))
         }
     }
-}
-
-fn now_s() -> u64 {
-    SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default().as_secs()
 }

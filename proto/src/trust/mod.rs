@@ -80,8 +80,9 @@ pub fn random<const BYTES: usize>() -> Result<[u8; BYTES], TrustError> {
     Ok(bytes)
 }
 
-/// Seconds since 1970, as certificates and capabilities count; before 1970 it is 1970.
-fn unix_seconds(time: SystemTime) -> u64 {
+/// Seconds since 1970, as certificates, capabilities and logs count; before 1970 it is 1970.
+#[must_use]
+pub fn unix_seconds(time: SystemTime) -> u64 {
     time.duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default().as_secs()
 }
 

@@ -48,16 +48,18 @@ fn refused() -> Error {
     Error::InvalidCertificate(CertificateError::ApplicationVerificationFailure)
 }
 
-/// How a client knows the coordinator.
+/// How a client knows the server.
 #[derive(Debug)]
-pub(crate) enum CoordinatorCheck {
-    /// A member: by the authority in its own identity.
+pub(crate) enum ServerCheck {
+    /// A node: by exactly this certificate, of which the coordinator's plan told. There is no name check and no expiry.
+    Pinned(CertificateDer<'static>),
+    /// The coordinator, by a member: by the authority in its own identity.
     Authority(CertificateDer<'static>),
-    /// Who joins: by the blake3 of the authority, which the coordinator sends along.
+    /// The coordinator, by who joins: by the blake3 of the authority, which the coordinator sends along.
     Fingerprint([u8; 32]),
 }
 
-impl ServerCertVerifier for CoordinatorCheck {
+impl ServerCertVerifier for ServerCheck {
     fn verify_server_cert(
         &self,
         end_entity: &CertificateDer<'_>,
@@ -67,6 +69,8 @@ impl ServerCertVerifier for CoordinatorCheck {
         now: UnixTime,
     ) -> Result<ServerCertVerified, Error> {
         let authority = match self {
+            Self::Pinned(expected) if end_entity == expected => return Ok(ServerCertVerified::assertion()),
+            Self::Pinned(_) => return Err(refused()),
             Self::Authority(authority) => authority.clone(),
             Self::Fingerprint(fingerprint) => intermediates
                 .iter()

@@ -82,6 +82,7 @@ fn node_refuses(protocol: u32) -> bool {
         spool_quota_bytes: 1 << 20,
         share: Share::DEFAULT,
         local_stealing: true,
+        cached: Vec::new(),
         seed: 1,
     });
     let welcome =

@@ -225,7 +225,8 @@ impl Contents {
             let (folder, bytes, inputs) = (disk.folder(), bytes.clone(), inputs.clone());
             tokio::spawn(async move {
                 let write = move || folder.write(&content.hash, &bytes);
-                let result = tokio::task::spawn_blocking(write).await.unwrap_or_else(|_| Ok(()));
+                let result = tokio::task::spawn_blocking(write).await;
+                let result = result.unwrap_or_else(|error| Err(io::Error::other(error)));
                 let _ = inputs.send(Input::Stored { content, result }).await;
             });
         }
