@@ -15,10 +15,10 @@ use farm_core::{
         JobIndex, NodeId, NodeSession, StealId, TaskId,
     },
     message::{
-        AppHello, AppToCoordinator, AppToNode, Contact, CoordinatorToApp, CoordinatorToNode, CostNs,
-        DeviceLoad, DevicePlan, Executed, HeldJob, JobFailure, JobTicket, JobTrace, LatencyClass, Liveness,
-        NodeHello, NodePlan, NodeToApp, NodeToCoordinator, Plan, PlanJob, PlanRequest, Priority, ResultAck,
-        ResultHeader, RunningJob,
+        AppHello, AppToCoordinator, AppToNode, CacheFigures, Contact, CoordinatorToApp, CoordinatorToNode,
+        CostNs, DeviceLoad, DevicePlan, Executed, HeldJob, JobFailure, JobTicket, JobTrace, LatencyClass,
+        Liveness, NodeHello, NodePlan, NodeToApp, NodeToCoordinator, Plan, PlanJob, PlanRequest, Priority,
+        ResultAck, ResultHeader, RunningJob,
     },
     program::{Access, Content, JobProgram, Slicing},
     time::Instant,
@@ -96,14 +96,19 @@ pub(crate) const SEEDS: &[Seed] = &[
     ("node_to_coordinator", "valid-heartbeat", || {
         let running = Some(RunningJob { job: attempt(1), for_ns: 5_000 });
         let devices = vec![DeviceLoad { queued_jobs: 3, running }, DeviceLoad::default()];
-        node_to_coordinator(NodeToCoordinator::Heartbeat { sequence: 9, devices, spool_bytes: 1 << 20 })
+        let heartbeat =
+            NodeToCoordinator::Heartbeat { sequence: 9, devices, spool_bytes: 1 << 20, cache: cache() };
+        node_to_coordinator(heartbeat)
     }),
     ("node_to_coordinator", "valid-retracted", || {
         let [retracted, running, unknown] = [attempts(3), attempts(1), Vec::new()];
         node_to_coordinator(NodeToCoordinator::Retracted { steal: StealId(5), retracted, running, unknown })
     }),
     ("node_to_coordinator", "valid-cache", || {
-        let (held, gone) = (vec![ContentHash([1; 32])], vec![ContentHash([2; 32]); 3]);
+        let (held, gone) = (
+            vec![Content { hash: ContentHash([1; 32]), size_bytes: 5 << 20 }],
+            vec![ContentHash([2; 32]); 3],
+        );
         node_to_coordinator(NodeToCoordinator::CacheChanged { held, gone })
     }),
     ("coordinator_to_node", "valid-retract", || {
@@ -114,6 +119,9 @@ pub(crate) const SEEDS: &[Seed] = &[
             content: ContentHash([3; 32]),
             peer: Some(contact()),
         })
+    }),
+    ("coordinator_to_node", "valid-evict", || {
+        coordinator_to_node(CoordinatorToNode::Evict { contents: vec![ContentHash([3; 32]); 2] })
     }),
     ("farm_status", "valid-status", || control::encode::<v1::FarmStatus, _>(status())),
     ("timeline_head", "valid-head", || control::encode::<v1::TimelineHead, _>(head())),
@@ -373,6 +381,10 @@ fn report() -> NodeToCoordinator {
     }
 }
 
+fn cache() -> CacheFigures {
+    CacheFigures { memory_contents: 2, memory_bytes: 5 << 20, fetches: 3, ..CacheFigures::default() }
+}
+
 fn status() -> FarmStatus {
     let device = DeviceStatus {
         device: DeviceIndex(0),
@@ -383,6 +395,7 @@ fn status() -> FarmStatus {
         running_jobs: 1,
         executed_jobs: 5,
         device_time_ns: 1 << 40,
+        lost: true,
     };
     let node = NodeStatus {
         node: NodeId(4),
@@ -390,6 +403,7 @@ fn status() -> FarmStatus {
         state: NodeState::Draining,
         addresses: contact().addresses,
         devices: vec![device],
+        cache: cache(),
     };
     let app = AppStatus {
         app: AppId(7),
