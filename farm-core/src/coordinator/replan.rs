@@ -178,10 +178,13 @@ impl CoordinatorMachine {
         self.move_off(id, jobs);
     }
 
-    /// The application has results of these jobs already (or gave them up): nothing further is owed.
+    /// The application has results of these jobs already: of attempts that were given up here, or of which the node could
+    /// not tell. Nothing further is owed.
     pub(super) fn already_delivered(&mut self, app: AppId, jobs: &[JobId]) {
-        for job in jobs.iter().filter(|job| job.app == app) {
-            self.forget_job(*job);
+        for &job in jobs.iter().filter(|job| job.app == app) {
+            if self.job(job).is_some() {
+                self.forget_delivered(job);
+            }
         }
     }
 

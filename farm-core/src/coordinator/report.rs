@@ -130,9 +130,14 @@ impl CoordinatorMachine {
             }
             return;
         }
-        self.forget_job(job.job);
+        self.forget_delivered(job.job);
+    }
+
+    /// A job is over: its application has the result.
+    pub(super) fn forget_delivered(&mut self, job: JobId) {
+        self.forget_job(job);
         self.delivered_jobs += 1;
-        if let Some(app) = self.apps.get_mut(&job.job.app) {
+        if let Some(app) = self.apps.get_mut(&job.app) {
             app.delivered_jobs += 1;
         }
     }

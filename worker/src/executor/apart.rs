@@ -18,7 +18,7 @@ use tokio::sync::mpsc;
 use super::{
     Order,
     book::{Aborted, Book},
-    process::Process,
+    process::{NotOpen, Process},
     restarts::Restarts,
     wire::{FromExecutor, ToExecutor},
 };
@@ -59,7 +59,7 @@ impl ExecutorProcess {
         contents: Shelf,
         events: mpsc::UnboundedSender<DeviceEvent>,
     ) -> Result<(Self, DeviceInfo), String> {
-        let (process, info) = Process::start(&launch).await?;
+        let (process, info) = first(&launch).await?;
         let (commands, received) = mpsc::unbounded_channel();
         let supervisor = Supervisor {
             launch,
@@ -262,7 +262,7 @@ impl Supervisor {
             };
             match opened {
                 Ok((process, _)) => return Ok(Some(process)),
-                Err(reason) => rest = self.restarts.refused(reason)?,
+                Err(error) => rest = self.restarts.refused(error.reason())?,
             }
         }
     }
@@ -287,5 +287,21 @@ impl Supervisor {
     fn tell(&self, what: DeviceNews) {
         // The driver is gone only when the worker ends: nobody is left to hear.
         let _ = self.events.send(DeviceEvent { device: self.index, what });
+    }
+}
+
+/// The first process of a device. One that ends before it can say how the device is, as by a signal, is tried again.
+async fn first(launch: &Launch) -> Result<(Process, DeviceInfo), String> {
+    let mut restarts = Restarts::default();
+    loop {
+        match Process::start(launch).await {
+            Ok(opened) => return Ok(opened),
+            Err(NotOpen::Refused(reason)) => return Err(reason),
+            Err(NotOpen::Ended(reason)) => {
+                tracing::warn!(device = %launch.spec, reason, "an executor did not come up");
+                let rest = restarts.refused(reason)?;
+                tokio::time::sleep(rest).await;
+            }
+        }
     }
 }

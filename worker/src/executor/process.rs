@@ -31,6 +31,23 @@ const ENDING_LIMIT: Duration = Duration::from_secs(5);
 /// Messages of the process that wait for the supervisor; the process waits when there are more.
 const QUEUED_MESSAGES: usize = 16;
 
+/// Why a device is not open; the texts are for people.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(super) enum NotOpen {
+    /// It is not there, or the driver does not give it.
+    Refused(String),
+    /// The process ended before it could say.
+    Ended(String),
+}
+
+impl NotOpen {
+    pub(super) fn reason(self) -> String {
+        match self {
+            Self::Refused(reason) | Self::Ended(reason) => reason,
+        }
+    }
+}
+
 /// What the reader brings: a message with its payload, or why there is none any more.
 type Said = Result<(FromExecutor, Bytes), String>;
 
@@ -48,10 +65,11 @@ impl Process {
     /// Starts a process and waits until its device is open.
     ///
     /// # Errors
-    /// It does not start, or the device does not open in time; the text is for people.
-    pub(super) async fn start(launch: &Launch) -> Result<(Self, DeviceInfo), String> {
-        let failed =
-            |error: std::io::Error| format!("no executor process for `--device {}`: {error}", launch.spec);
+    /// It does not start, or the device does not open in time.
+    pub(super) async fn start(launch: &Launch) -> Result<(Self, DeviceInfo), NotOpen> {
+        let failed = |error: std::io::Error| {
+            NotOpen::Ended(format!("no executor process for `--device {}`: {error}", launch.spec))
+        };
         let (ours, theirs) = StdStream::pair().map_err(failed)?;
         ours.set_nonblocking(true).map_err(failed)?;
         let child = Command::new(&launch.program)
@@ -75,12 +93,15 @@ impl Process {
         let greeting = timeout(OPENING_LIMIT, process.said()).await;
         let refusal = match greeting {
             Ok(Ok((FromExecutor::Opened(info), _))) => return Ok((process, info)),
-            Ok(Ok((FromExecutor::Refused(reason), _))) => reason,
-            Ok(Ok((other, _))) => format!("the executor began with {other:?}"),
+            Ok(Ok((FromExecutor::Refused(reason), _))) => NotOpen::Refused(reason),
+            Ok(Ok((other, _))) => NotOpen::Ended(format!("the executor began with {other:?}")),
             Ok(Err(error)) => {
-                format!("the executor of `--device {}` {}; {error}", launch.spec, process.ended().await)
+                let ended = process.ended().await;
+                NotOpen::Ended(format!("the executor of `--device {}` {ended}; {error}", launch.spec))
             }
-            Err(_) => format!("`--device {}` was not open within {OPENING_LIMIT:?}", launch.spec),
+            Err(_) => {
+                NotOpen::Ended(format!("`--device {}` was not open within {OPENING_LIMIT:?}", launch.spec))
+            }
         };
         process.kill().await;
         Err(refusal)

@@ -40,6 +40,8 @@ pub(super) fn serve(spec: &str) -> ExitCode {
             end_soon();
             ExitCode::SUCCESS
         }
+        // The worker was gone before the device was open.
+        Err(error) if error.kind() == io::ErrorKind::BrokenPipe => ExitCode::SUCCESS,
         Err(error) => {
             // Whoever started this by hand reads it.
             let _ = writeln!(io::stderr(), "an executor is started by a worker: {error}");
