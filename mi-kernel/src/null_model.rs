@@ -372,7 +372,7 @@ mod tests {
             Accumulators::from_parts(3, vec![0, sum, 0], vec![0, squares, 0], vec![0, reached, 0], maxima)
         };
         assert!(of(6, 12, 3, 3).is_ok(), "2 three times");
-        assert!(of(i64::MIN, u64::MAX, 0, 1 << 20).is_ok(), "the largest sums that fit");
+        assert!(of(-(1 << 32), 1 << 63, 0, 2).is_ok(), "the least X twice: both sides are equal");
         for (case, (sum, squares, reached, runs)) in [
             ("a sum without squares", (7, 12, 0, 3)),
             ("a sum below", (-7, 12, 0, 3)),
