@@ -32,5 +32,4 @@ pub use self::{
     executor::{Executor, ExecutorConfig, ExecutorEvent, Host, HungDevice, Order, expand},
     real::{Adapter, enumerate},
     spec::{DeviceSpec, SimSpec, SpecError},
-    text::{TextError, check_module},
 };

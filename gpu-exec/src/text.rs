@@ -13,17 +13,17 @@ pub(crate) const MAX_TEXT_BYTES: usize = 1 << 20;
 /// of 16 MiB, overflows at some 50,000, and one of the usual 2 MiB at an eighth of that.
 pub(crate) const MAX_LEVELS: usize = 2_000;
 /// Most declarations. naga follows each to those that it uses by recursion: 10,000 functions that call the next one overflow a
-/// thread of 2 MiB. The path tracer has 400.
+/// thread of 2 MiB. Our own kernels are far below.
 pub(crate) const MAX_DECLARATIONS: usize = 4_000;
-/// Most statements and expressions of an entry point with each function counted once for each call that leads to it. The path
-/// tracer's largest has 20,000.
+/// Most statements and expressions of an entry point with each function counted once for each call that leads to it. Our own
+/// kernels are far below.
 pub(crate) const MAX_EXPANDED: u64 = 500_000;
 /// Longest message of the parser that is passed on, in bytes: it shows the line at fault, however long that is.
 pub(crate) const MAX_MESSAGE_BYTES: usize = 2 << 10;
 
 /// A module's text is refused. Not to be retried.
 #[derive(Clone, Debug, PartialEq, Eq, Error)]
-pub enum TextError {
+pub(crate) enum TextError {
     /// Too long.
     #[error("WGSL text of {bytes} B is over {MAX_TEXT_BYTES} B")]
     TooLong {
@@ -56,12 +56,12 @@ pub enum TextError {
     },
 }
 
-/// Whether a module's bytes may go to a compiler: they are text within its bounds, and WGSL that expands to a bounded program.
-/// Whether they are valid is the compiler's to say.
+/// Reads a module's bytes: text within its bounds, and WGSL that expands to a bounded program. Whether it is valid is the
+/// compiler's to say.
 ///
 /// # Errors
 /// What is wrong, with the line where there is one.
-pub fn check_module(bytes: &[u8]) -> Result<(), TextError> {
+pub(crate) fn parse(bytes: &[u8]) -> Result<(&str, naga::Module), TextError> {
     if bytes.len() > MAX_TEXT_BYTES {
         return Err(TextError::TooLong { bytes: bytes.len() });
     }
@@ -69,11 +69,12 @@ pub fn check_module(bytes: &[u8]) -> Result<(), TextError> {
     check_levels(text)?;
     let module = naga::front::wgsl::parse_str(text)
         .map_err(|error| TextError::Parser(cut(&error.emit_to_string(text))))?;
-    check_expansion(&module)
+    check_expansion(&module)?;
+    Ok((text, module))
 }
 
 /// The start of a message, without trailing blank lines.
-fn cut(message: &str) -> String {
+pub(crate) fn cut(message: &str) -> String {
     let message = message.trim_end();
     match message.len() > MAX_MESSAGE_BYTES {
         true => format!("{}...", &message[..message.floor_char_boundary(MAX_MESSAGE_BYTES)]),
@@ -231,7 +232,7 @@ mod tests {
             ("blocks", of_main(&"{".repeat(MANY))),
             ("types", format!("alias a = {}", "vec2<".repeat(MANY))),
         ] {
-            let error = check_module(format!("\n// (((\n/* [[[ /* */ \n */{text}").as_bytes()).unwrap_err();
+            let error = parse(format!("\n// (((\n/* [[[ /* */ \n */{text}").as_bytes()).unwrap_err();
             let line = matches!(error, TextError::TooDeep { line } if line >= 4);
             assert!(line, "{what}: {error:?}");
         }
@@ -247,7 +248,7 @@ mod tests {
             "const T = array<u32, 20000>({table});\n{}",
             of_main(&format!("var x = T[7]; {statements} {ifs} {deep}"))
         );
-        assert_eq!(check_module(text.as_bytes()), Ok(()));
+        assert_eq!(parse(text.as_bytes()).err(), None);
     }
 
     #[test]
@@ -258,8 +259,8 @@ mod tests {
                 .chain([format!("fn f{count}() {{}}")])
                 .collect()
         };
-        assert_eq!(check_module(chain(MAX_DECLARATIONS / 2).as_bytes()), Ok(()));
-        let error = check_module(chain(20_000).as_bytes()).unwrap_err();
+        assert_eq!(parse(chain(MAX_DECLARATIONS / 2).as_bytes()).err(), None);
+        let error = parse(chain(20_000).as_bytes()).unwrap_err();
         assert_eq!(error, TextError::TooMany { line: MAX_DECLARATIONS + 1 });
     }
 
@@ -271,18 +272,17 @@ mod tests {
             let text: String = doubled.collect();
             format!("fn f0() -> u32 {{ return 1u; }}\n{text}{}", of_main(&format!("var x = f{twice}();")))
         };
-        assert_eq!(check_module(functions(10).as_bytes()), Ok(()), "1,024 calls");
-        let error = check_module(functions(30).as_bytes()).unwrap_err();
+        assert_eq!(parse(functions(10).as_bytes()).err(), None, "1,024 calls");
+        let error = parse(functions(30).as_bytes()).unwrap_err();
         assert!(matches!(&error, TextError::TooMuch { function } if function.starts_with('f')), "{error}");
     }
 
     #[test]
     fn messages_are_short_and_name_the_place() {
-        let error =
-            check_module(of_main(&format!("let x = \"{}", "a".repeat(100_000))).as_bytes()).unwrap_err();
+        let error = parse(of_main(&format!("let x = \"{}", "a".repeat(100_000))).as_bytes()).unwrap_err();
         assert!(error.to_string().len() <= MAX_MESSAGE_BYTES + 3, "{} B", error.to_string().len());
-        assert!(check_module(b"fn main( {").unwrap_err().to_string().contains(":1:"), "the line is named");
-        assert!(matches!(check_module(&[0xff]), Err(TextError::NotText(_))));
-        assert!(matches!(check_module(&vec![b' '; MAX_TEXT_BYTES + 1]), Err(TextError::TooLong { .. })));
+        assert!(parse(b"fn main( {").unwrap_err().to_string().contains(":1:"), "the line is named");
+        assert!(matches!(parse(&[0xff]), Err(TextError::NotText(_))));
+        assert!(matches!(parse(&vec![b' '; MAX_TEXT_BYTES + 1]), Err(TextError::TooLong { .. })));
     }
 }

@@ -12,9 +12,7 @@ use naga::{
 };
 
 use super::{adapter::Gpu, scope::Refusal, trusted};
-
-/// Most bytes of a module's text.
-pub(crate) const MAX_SOURCE_BYTES: usize = 1 << 20;
+use crate::text;
 
 /// A compiled module.
 #[derive(Debug)]
@@ -77,14 +75,8 @@ impl Module {
     /// Checks and compiles a module's bytes.
     pub(crate) fn compile(gpu: &Gpu, bytes: &[u8], unchecked: bool) -> Result<Self, Refusal> {
         let invalid = |text: String| Refusal::Invalid(text);
-        if bytes.len() > MAX_SOURCE_BYTES {
-            return Err(invalid(format!("WGSL text of {} B is over {MAX_SOURCE_BYTES} B", bytes.len())));
-        }
-        let source =
-            std::str::from_utf8(bytes).map_err(|error| invalid(format!("no UTF-8 text: {error}")))?;
-        let parsed = naga::front::wgsl::parse_str(source)
-            .map_err(|error| invalid(located(&error.emit_to_string(source))))?;
-        let info = validated(&parsed).map_err(|error| invalid(located(&error.emit_to_string(source))))?;
+        let (source, parsed) = text::parse(bytes).map_err(|error| invalid(error.to_string()))?;
+        let info = validated(&parsed).map_err(|error| invalid(text::cut(&error.emit_to_string(source))))?;
         let reflected = reflect(&parsed, &info);
         let on_storage = (gpu.kind == DeviceKind::Cpu)
             .then(|| globals_on_storage(parsed, gpu.limits.max_storage_buffers_per_shader_stage, &reflected))
@@ -133,11 +125,6 @@ fn globals_on_storage(
         }
     }
     validated(&module).is_ok().then_some(module)
-}
-
-/// naga's message without its trailing blank lines.
-fn located(message: &str) -> String {
-    message.trim_end().to_owned()
 }
 
 struct Reflected {
