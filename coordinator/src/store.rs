@@ -16,7 +16,7 @@ use farm_core::id::Epoch;
 use proto::trust::{Member, Membership, Principal, Role, TrustError};
 use redb::{
     Database, DatabaseError, ReadableDatabase as _, ReadableTable as _, ReadableTableMetadata as _,
-    TableDefinition,
+    TableDefinition, TableError,
 };
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
@@ -120,8 +120,15 @@ impl Store {
             DatabaseError::DatabaseAlreadyOpen => fault(directory, &"another coordinator uses it"),
             error => fault(path, &error),
         })?;
+        let before = everything(&database);
         match database.check_integrity() {
             Ok(true) => Ok(database),
+            // It mended something. Mostly its count of free pages, which does not survive every sequence of changes.
+            Ok(false)
+                if before.is_ok_and(|before| everything(&database).is_ok_and(|after| after == before)) =>
+            {
+                Ok(database)
+            }
             Ok(false) => Err(fault(
                 path,
                 &"was damaged, and is now what it was some changes ago: look at members and tokens after the next start, or \
@@ -358,6 +365,38 @@ fn enrol(
     Ok(())
 }
 
+/// All entries of all tables, in order.
+fn everything(database: &Database) -> Result<Vec<(Vec<u8>, Vec<u8>)>, redb::Error> {
+    fn absent<T>(opened: Result<T, TableError>) -> Result<Option<T>, redb::Error> {
+        match opened {
+            Ok(table) => Ok(Some(table)),
+            Err(TableError::TableDoesNotExist(_)) => Ok(None),
+            Err(error) => Err(error.into()),
+        }
+    }
+    let transaction = database.begin_read()?;
+    let mut entries = Vec::new();
+    if let Some(numbers) = absent(transaction.open_table(NUMBERS))? {
+        for entry in numbers.iter()? {
+            let (key, value) = entry?;
+            entries.push((key.value().into(), value.value().to_le_bytes().into()));
+        }
+    }
+    if let Some(tokens) = absent(transaction.open_table(TOKENS))? {
+        for entry in tokens.iter()? {
+            let (key, value) = entry?;
+            entries.push((key.value().into(), value.value().into()));
+        }
+    }
+    if let Some(members) = absent(transaction.open_table(MEMBERS))? {
+        for entry in members.iter()? {
+            let (key, value) = entry?;
+            entries.push((key.value().into(), value.value().into()));
+        }
+    }
+    Ok(entries)
+}
+
 fn is_operator(uri: &str) -> bool {
     uri.parse().is_ok_and(|principal: Principal| principal.role == Role::Operator)
 }
@@ -442,13 +481,12 @@ mod tests {
             bytes[at] ^= 0xff;
             bytes
         };
-        // Cut; the layout and the slots in the header; all pages.
+        // Cut; the header; all pages.
         let mut pages = whole.clone();
         pages[4_096..].iter_mut().for_each(|byte| *byte ^= 0x55);
         for (case, bytes) in [
             ("cut to half", whole[..whole.len() / 2].to_vec()),
             ("cut to a byte", whole[..1].to_vec()),
-            ("another layout", changed(20)),
             ("another magic", changed(0)),
             ("other pages", pages),
             ("text", b"not a store".to_vec()),
@@ -457,12 +495,30 @@ mod tests {
             let error = Store::open(directory.path()).map(drop).expect_err(case).to_string();
             assert!(error.contains(FILE), "{case}: {error}");
         }
-        fs::write(&path, &whole).unwrap();
+        // A layout in the header that is wrong is mended, and costs nothing.
+        fs::write(&path, changed(20)).unwrap();
         assert_eq!(
             Store::open(directory.path()).unwrap().begin_epoch().unwrap(),
             Epoch(1),
             "it was the file"
         );
+    }
+
+    /// Seen in `tests/secured.rs`: after some joins redb mends its count of free pages, and says so as it says of damage.
+    #[test]
+    fn a_store_that_was_written_to_opens_again() {
+        let directory = tempfile::tempdir().unwrap();
+        for life in 1..=12 {
+            let store = Store::open(directory.path()).unwrap();
+            assert_eq!(store.begin_epoch().unwrap(), Epoch(life));
+            for token in 0..life {
+                let maker = "x".repeat(300 * token as usize);
+                let (role, name) = ("node".to_owned(), String::new());
+                let token = Token { id: 0, role, name, expires_s: 2, uses_left: 1, maker };
+                store.add_token(&life.to_le_bytes(), token, u64::from(life) % 3).unwrap();
+            }
+            store.remove_token(u64::from(life)).unwrap();
+        }
     }
 
     #[test]

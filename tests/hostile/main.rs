@@ -18,7 +18,7 @@ use std::{
     collections::BTreeSet,
     fs::{self, File},
     os::unix::fs::FileExt as _,
-    panic::{AssertUnwindSafe, catch_unwind},
+    panic::{self, AssertUnwindSafe, catch_unwind},
     path::{Path, PathBuf},
     thread,
     time::{Duration, Instant},
@@ -191,6 +191,8 @@ const MAX_ERROR_BYTES: usize = 8 << 10;
 /// Runs a target over its corpus, what is made of it, and its storms.
 fn replay(target: Target) {
     let started = Instant::now();
+    // A panic that the decoder itself catches is none; but its backtrace would count as memory, debug symbols and all.
+    panic::set_hook(Box::new(|panic| eprintln!("{panic}")));
     let thread = thread::Builder::new().name(target.name.to_owned()).stack_size(STACK_BYTES);
     let (runs, failures) = thread.spawn(move || failures_of(&target)).unwrap().join().unwrap();
     println!("{}: {runs} inputs, {:.1} s", target.name, started.elapsed().as_secs_f64());

@@ -1,4 +1,4 @@
-//! Executors as processes of the real binary, on lavapipe: they may die at any time, and cost no more than what was on
+//! Executors as processes of the real binary, on lavapipe or a GPU: they may die at any time, and cost no more than what was on
 //! their device.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on panics")]
@@ -17,21 +17,27 @@ use client_sdk::{
     RetrieveError, Task, TaskData, TaskError, TaskGraph, WaitReason,
 };
 use coordinator::{CoordinatorHandle, CoordinatorOptions};
+use gpu_exec::DeviceSpec;
 use worker::{Isolation, WorkerHandle, WorkerOptions};
 
-/// Dependent multiplications in each of 64 invocations a workgroup, 60,000 rounds each: lavapipe ends longer loops.
+/// Dependent multiplications in each of 64 invocations a workgroup. lavapipe ends loops after 65,535 rounds, whatever is asked.
 const SPIN: &str = "
 @group(0) @binding(0) var<storage, read> start: array<u32>;
 @group(0) @binding(1) var<storage, read_write> out: array<u32>;
-@group(0) @binding(2) var<storage, read> number: u32;
+@group(0) @binding(2) var<storage, read> number_and_rounds: array<u32, 2>;
 @compute @workgroup_size(64) fn spin(@builtin(global_invocation_id) id: vec3u) {
-    var x = start[0] + number + id.x + id.y * 64u;
-    for (var i = 0u; i < 60000u; i++) { x = (x ^ (x >> 13u)) * 1664525u + i; }
+    var x = start[0] + number_and_rounds[0] + id.x + id.y * 64u;
+    for (var i = 0u; i < number_and_rounds[1]; i++) { x = (x ^ (x >> 13u)) * 1664525u + i; }
     out[id.x + id.y * 64u] = x;
 }";
 
 /// Far more than a job takes.
 const PATIENCE: Duration = Duration::from_secs(120);
+
+/// The device under test; a GPU where the variable names one.
+fn device() -> DeviceSpec {
+    std::env::var("GLEANER_TEST_DEVICE").map_or(DeviceSpec::Cpu, |spec| spec.parse().unwrap())
+}
 
 /// A test looks for the executors of its own process: no two at a time.
 static ONE_FARM: tokio::sync::Mutex<()> = tokio::sync::Mutex::const_new(());
@@ -48,11 +54,8 @@ impl TestFarm {
         let only = ONE_FARM.lock().await;
         let coordinator = coordinator::start(CoordinatorOptions::embedded()).await.unwrap();
         let address = coordinator.grpc_addr().to_string();
-        let options = WorkerOptions {
-            isolation,
-            job_limit,
-            ..WorkerOptions::embedded(address, vec!["cpu".parse().unwrap()])
-        };
+        let options =
+            WorkerOptions { isolation, job_limit, ..WorkerOptions::embedded(address, vec![device()]) };
         Self { _only: only, coordinator, worker: worker::start(options).await.unwrap() }
     }
 
@@ -78,17 +81,18 @@ impl TestFarm {
 /// Results by job number.
 type Brought = Arc<Mutex<BTreeMap<u32, Bytes>>>;
 
-/// Jobs of `groups` workgroups each.
+/// Jobs of `groups` workgroups each, and so many rounds.
 struct Spins {
     jobs: u32,
     groups: u32,
+    rounds: u32,
     shared: Option<(Content, Content)>,
     brought: Brought,
 }
 
 impl Spins {
-    fn new(jobs: u32, groups: u32) -> Self {
-        Self { jobs, groups, shared: None, brought: Brought::default() }
+    fn new(jobs: u32, groups: u32, rounds: u32) -> Self {
+        Self { jobs, groups, rounds, shared: None, brought: Brought::default() }
     }
 }
 
@@ -102,8 +106,10 @@ impl Task for Spins {
 
     fn jobs(&mut self) -> Vec<Box<dyn Job>> {
         let job = |number| {
-            let (groups, shared) = (self.groups, self.shared.unwrap());
-            Box::new(Spin { number, groups, shared, brought: Arc::clone(&self.brought) }) as Box<dyn Job>
+            let Self { groups, rounds, .. } = *self;
+            let shared = self.shared.unwrap();
+            Box::new(Spin { number, groups, rounds, shared, brought: Arc::clone(&self.brought) })
+                as Box<dyn Job>
         };
         (0..self.jobs).map(job).collect()
     }
@@ -112,6 +118,7 @@ impl Task for Spins {
 struct Spin {
     number: u32,
     groups: u32,
+    rounds: u32,
     shared: (Content, Content),
     brought: Brought,
 }
@@ -127,12 +134,13 @@ impl Job for Spin {
         let (module, start) = self.shared;
         let kernel = cmd.function(module, "spin");
         let out = cmd.malloc(self.result_bytes())?;
-        let number = cmd.malloc(4)?;
-        cmd.memcpy_htod_buffer(number, 0, &self.number.to_le_bytes())?;
+        let own = cmd.malloc(8)?;
+        cmd.memcpy_htod_buffer(own, 0, &self.number.to_le_bytes())?;
+        cmd.memcpy_htod_buffer(own, 4, &self.rounds.to_le_bytes())?;
         let start = cmd.task_allocation(start);
         cmd.param_in(kernel, 0, start)?;
         cmd.param_in_out(kernel, 1, out)?;
-        cmd.param_in(kernel, 2, number)?;
+        cmd.param_in(kernel, 2, own)?;
         cmd.launch(kernel, [1, self.groups, 1])?;
         cmd.memcpy_dtoh(out, 0, self.result_bytes())
     }
@@ -146,7 +154,10 @@ impl Job for Spin {
 }
 
 async fn spin(app: &Farm, jobs: u32, groups: u32) -> Result<BTreeMap<u32, Bytes>, FarmError> {
-    let task = Spins::new(jobs, groups);
+    run(app, Spins::new(jobs, groups, 60_000)).await
+}
+
+async fn run(app: &Farm, task: Spins) -> Result<BTreeMap<u32, Bytes>, FarmError> {
     let brought = Arc::clone(&task.brought);
     app.run(TaskGraph::new().task("spin", task)).await?;
     Ok(std::mem::take(&mut *brought.lock().unwrap()))
@@ -222,8 +233,8 @@ async fn a_kernel_that_does_not_end_fails_its_job_and_the_device_comes_back() {
     let farm = TestFarm::apart(Duration::from_secs(1)).await;
     let app = farm.connect().await;
     let before = executors()[0];
-    // Far more than a second in one launch that cannot be cut.
-    let error = spin(&app, 1, 60_000).await.unwrap_err();
+    // Minutes on any device, in one launch that cannot be cut.
+    let error = run(&app, Spins::new(1, 60_000, u32::MAX)).await.unwrap_err();
     let FarmError::JobFailed { failure: JobFailure::Poison(last), .. } = &error else { panic!("{error}") };
     assert!(last.contains("Timeout"), "{last}");
     assert_eq!(spin(&app, 3, 1).await.unwrap().len(), 3, "the device serves the next ones");

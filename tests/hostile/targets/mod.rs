@@ -53,7 +53,8 @@ pub(crate) const TARGETS: &[Target] = &[
     roomy("coordinator_to_app", 128, wire::coordinator_to_app),
     roomy("node_to_coordinator", 128, wire::node_to_coordinator),
     roomy("coordinator_to_node", 128, wire::coordinator_to_node),
-    roomy("farm_status", 128, wire::farm_status),
+    // An empty node is two bytes on the wire, and in memory a structure with its cache's figures.
+    roomy("farm_status", 192, wire::farm_status),
     roomy("timeline_head", 128, wire::timeline_head),
     roomy("timeline_segments", 128, wire::timeline_segments),
     // Plug-ins' pipes.
