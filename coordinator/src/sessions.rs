@@ -208,12 +208,12 @@ impl Admin for Sessions {
         let (node, contents) =
             eviction(request.into_inner()).map_err(|error| Status::invalid_argument(error.to_string()))?;
         let what = serde_json::json!({ "node": node.map(|node| node.0), "contents": contents.len() });
-        match self.owner.evict(node, contents).await.ok_or_else(stopping)? {
-            true => {
+        match (self.owner.evict(node, contents).await.ok_or_else(stopping)?, node) {
+            (false, Some(node)) => Err(Status::not_found(format!("{node} is not registered"))),
+            (true, _) | (false, None) => {
                 self.gate.done("evict", operator.as_ref(), what);
                 Ok(Response::new(v1::EvictResponse {}))
             }
-            false => Err(Status::not_found(format!("{} is not registered", node.unwrap_or(NodeId(0))))),
         }
     }
 

@@ -365,8 +365,11 @@ fn enrol(
     Ok(())
 }
 
+/// A key and its value, as bytes.
+type Entry = (Vec<u8>, Vec<u8>);
+
 /// All entries of all tables, in order.
-fn everything(database: &Database) -> Result<Vec<(Vec<u8>, Vec<u8>)>, redb::Error> {
+fn everything(database: &Database) -> Result<Vec<Entry>, redb::Error> {
     fn absent<T>(opened: Result<T, TableError>) -> Result<Option<T>, redb::Error> {
         match opened {
             Ok(table) => Ok(Some(table)),

@@ -108,7 +108,7 @@ async fn an_app_and_a_node_meet_through_sessions() {
             sequence: 9,
             devices: Vec::new(),
             spool_bytes: 0,
-            cache: CacheFigures::default(),
+            cache: Some(CacheFigures::default()),
         })
         .unwrap();
     loop {

@@ -382,8 +382,8 @@ pub enum NodeToCoordinator {
         devices: Vec<DeviceLoad>,
         /// Executed results not yet acknowledged, in bytes.
         spool_bytes: u64,
-        /// How the node's cache of contents stands.
-        cache: CacheFigures,
+        /// How the node's cache of contents stands; `None` from a node that does not know of caches on demand.
+        cache: Option<CacheFigures>,
     },
     /// What ended since the last report. Batched by the machine: every 5 ms or 64 jobs.
     Report {

@@ -144,7 +144,7 @@ fn coordinator_event(step: Step) -> coordinator::Event {
             sequence: 1,
             devices: vec![farm_core::message::DeviceLoad::default(); step.two.into()],
             spool_bytes: 0,
-            cache: CacheFigures::default(),
+            cache: Some(CacheFigures::default()),
         }),
         7 | 9 => from_node(NodeToCoordinator::Report {
             sent_at: Instant(u64::from(step.four)),
@@ -273,7 +273,7 @@ fn worker_event(step: Step) -> worker::Event {
         25 if step.three == 0 && step.four == 0 => worker::Event::DrainRequested,
         27 => worker::Event::Yielded { job: job(step), device },
         28 => worker::Event::Resumed { job: job(step), device },
-        29 => worker::Event::ContentEvicted(ContentHash([step.two; 32])),
+        29 => worker::Event::ContentsEvicted(vec![ContentHash([step.two; 32])]),
         30 => worker::Event::FromCoordinator(CoordinatorToNode::Located {
             content: ContentHash([step.two; 32]),
             peer: step.three.is_multiple_of(2).then(contact),

@@ -31,6 +31,9 @@ pub trait Host: Send + Sync + 'static {
     /// down now, this job or a running one is the cause.
     fn preparing(&self, _job: JobAttempt) {}
 
+    /// It is prepared. One that cannot be ends as any other.
+    fn prepared(&self, _job: JobAttempt) {}
+
     /// The bytes of a content that neither the order nor the device has. May block, for a bounded time.
     fn content(&self, _hash: &ContentHash) -> Option<Bytes> {
         None

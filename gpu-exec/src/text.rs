@@ -33,6 +33,14 @@ pub(crate) enum TextError {
     /// No text.
     #[error("no UTF-8 text: {0}")]
     NotText(#[from] std::str::Utf8Error),
+    /// A line end or blank of the unusual kind.
+    #[error("line {line}: holds {mark:?}; end lines with a line feed, and part words with blanks or tabs")]
+    Mark {
+        /// Where, from 1.
+        line: usize,
+        /// Which.
+        mark: char,
+    },
     /// Brackets in brackets, or operators in a row.
     #[error("line {line}: an expression, type or statement of more than {MAX_LEVELS} levels")]
     TooDeep {
@@ -66,6 +74,7 @@ pub(crate) fn parse(bytes: &[u8]) -> Result<(&str, naga::Module), TextError> {
         return Err(TextError::TooLong { bytes: bytes.len() });
     }
     let text = std::str::from_utf8(bytes)?;
+    check_marks(text)?;
     check_levels(text)?;
     let module = naga::front::wgsl::parse_str(text)
         .map_err(|error| TextError::Parser(cut(&error.emit_to_string(text))))?;
@@ -102,6 +111,22 @@ impl Level {
     }
 }
 
+/// Refuses line ends and blanks that WGSL has and nobody uses: a comment ends at each, and a module could hide from the check
+/// below what it shows to the parser.
+fn check_marks(text: &str) -> Result<(), TextError> {
+    let mut line = 1;
+    for mark in text.chars() {
+        match mark {
+            '\n' => line += 1,
+            '\u{b}' | '\u{c}' | '\u{85}' | '\u{200e}' | '\u{200f}' | '\u{2028}' | '\u{2029}' => {
+                return Err(TextError::Mark { line, mark });
+            }
+            _ => {}
+        }
+    }
+    Ok(())
+}
+
 /// An upper bound on the levels of the syntax tree, from the text's marks alone: nothing here recurses.
 fn check_levels(text: &str) -> Result<(), TextError> {
     let (mut open, mut here, mut line, mut declarations) = (Vec::new(), Level::default(), 1, 0);
@@ -121,7 +146,8 @@ fn check_levels(text: &str) -> Result<(), TextError> {
         match byte {
             b'\n' => line += 1,
             b'/' if rest.starts_with(b"/") => {
-                rest = &rest[rest.iter().position(|byte| *byte == b'\n').unwrap_or(rest.len())..];
+                rest =
+                    &rest[rest.iter().position(|byte| matches!(byte, b'\n' | b'\r')).unwrap_or(rest.len())..];
             }
             b'/' if rest.starts_with(b"*") => rest = comment(rest, &mut line),
             b'(' | b'[' | b'{' => open.push(std::mem::take(&mut here)),
@@ -235,6 +261,17 @@ mod tests {
             let error = parse(format!("\n// (((\n/* [[[ /* */ \n */{text}").as_bytes()).unwrap_err();
             let line = matches!(error, TextError::TooDeep { line } if line >= 4);
             assert!(line, "{what}: {error:?}");
+        }
+    }
+
+    /// Found by reading: naga ends comments at more marks than a line feed.
+    #[test]
+    fn unusual_line_ends_hide_nothing() {
+        let sums = format!("//\r{}", of_main(&format!("let x = 1{};", " + 1".repeat(100_000))));
+        assert!(matches!(parse(sums.as_bytes()), Err(TextError::TooDeep { line: 1 })));
+        for mark in ['\u{b}', '\u{c}', '\u{85}', '\u{200e}', '\u{200f}', '\u{2028}', '\u{2029}'] {
+            let text = of_main(&format!("if true {{}}{mark}else if true {{}}"));
+            assert_eq!(parse(text.as_bytes()).err(), Some(TextError::Mark { line: 1, mark }));
         }
     }
 

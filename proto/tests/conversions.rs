@@ -251,7 +251,7 @@ fn node_to_coordinator() -> impl Strategy<Value = NodeToCoordinator> {
     });
     prop_oneof![
         hello,
-        (any::<(u64, u64)>(), vec(load, 0..9), cache()).prop_map(
+        (any::<(u64, u64)>(), vec(load, 0..9), option::of(cache())).prop_map(
             |((sequence, spool_bytes), devices, cache)| {
                 NodeToCoordinator::Heartbeat { sequence, devices, spool_bytes, cache }
             }

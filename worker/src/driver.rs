@@ -443,13 +443,11 @@ impl Driver {
         }
         let fetch: Pin<Box<dyn Future<Output = Result<Bytes, String>> + Send>> = match from {
             Provider::Application(link) => {
-                let Some(outbox) = self.links.get(&link) else {
-                    let reason = "its application's link is over".to_owned();
-                    self.found.push(Event::ContentFailed { content: content.hash, reason });
-                    return;
-                };
-                let sender = outbox.sender().clone();
-                Box::pin(async move { sender.fetch(content).await.map_err(|error| error.to_string()) })
+                let sender = self.links.get(&link).map(|outbox| outbox.sender().clone());
+                Box::pin(async move {
+                    let sender = sender.ok_or("its application's link is over")?;
+                    sender.fetch(content).await.map_err(|error| error.to_string())
+                })
             }
             Provider::Node(contact) => {
                 Box::pin(link::fetch_from_peer(contact, self.options.identity.clone(), content))

@@ -133,7 +133,10 @@ impl CoordinatorMachine {
                 continue;
             }
             let spread = self.spreads.contents.entry(hash).or_default();
-            spread.size_bytes = size_bytes;
+            // An earlier version does not say it.
+            if size_bytes > 0 {
+                spread.size_bytes = size_bytes;
+            }
             spread.forget(node);
             spread.holders.insert(node);
             self.serve(now, hash);
@@ -249,8 +252,10 @@ impl CoordinatorMachine {
 
     /// Has nodes drop contents that no job needs; all nodes if none is named, all contents if none is.
     pub(super) fn evict(&mut self, node: Option<NodeId>, contents: &[ContentHash]) {
-        let asked: Vec<NodeId> =
-            self.nodes.keys().copied().filter(|id| node.is_none_or(|node| node == *id)).collect();
+        // A node of before this message would end its session over it.
+        let knows = |(id, known): (&NodeId, &Node)| known.cache.is_some().then_some(*id);
+        let named = |id: &NodeId| node.is_none_or(|node| node == *id);
+        let asked: Vec<NodeId> = self.nodes.iter().filter_map(knows).filter(named).collect();
         for id in asked {
             self.tell_node(id, CoordinatorToNode::Evict { contents: contents.to_vec() });
         }

@@ -169,8 +169,8 @@ pub(super) struct Node {
     pub(super) brought: BTreeMap<JobId, Brought>,
     /// Contents that its jobs named: it has them, or will soon.
     contents: BTreeSet<ContentHash>,
-    /// By the last heartbeat.
-    pub(super) cache: CacheFigures,
+    /// By the last heartbeat, if it says so.
+    pub(super) cache: Option<CacheFigures>,
     /// It joined and has not stolen yet: it may take jobs of any application.
     pub(super) joining: bool,
     /// When it may try to steal again, and how often in a row it tried in vain.
@@ -193,7 +193,7 @@ impl Node {
             jobs: BTreeSet::new(),
             brought: BTreeMap::new(),
             contents: BTreeSet::new(),
-            cache: CacheFigures::default(),
+            cache: None,
             joining: true,
             steal_at: now,
             vain_steals: 0,

@@ -33,7 +33,7 @@ impl CoordinatorMachine {
         }
     }
 
-    pub(super) fn loads_reported(&mut self, id: NodeId, loads: &[DeviceLoad], cache: CacheFigures) {
+    pub(super) fn loads_reported(&mut self, id: NodeId, loads: &[DeviceLoad], cache: Option<CacheFigures>) {
         let Some(node) = self.nodes.get_mut(&id) else { return };
         node.cache = cache;
         for (device, load) in node.devices.iter_mut().zip(loads) {

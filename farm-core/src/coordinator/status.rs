@@ -60,7 +60,7 @@ impl CoordinatorMachine {
                 state: node.state,
                 addresses: node.contact.addresses.clone(),
                 devices: devices(node),
-                cache: node.cache,
+                cache: node.cache.unwrap_or_default(),
             })
             .collect()
     }

@@ -145,9 +145,10 @@ impl WorkerMachine {
         }
     }
 
-    pub(super) fn content_evicted(&mut self, hash: ContentHash) {
-        if self.cached.remove(&hash).is_some() {
-            self.tell_cache_changed(Vec::new(), vec![hash]);
+    pub(super) fn contents_evicted(&mut self, mut gone: Vec<ContentHash>) {
+        gone.retain(|hash| self.cached.remove(hash).is_some());
+        for gone in gone.chunks(MAX_TOLD) {
+            self.tell_cache_changed(Vec::new(), gone.to_vec());
         }
     }
 

@@ -102,8 +102,8 @@ pub enum Event {
     },
     /// A content asked for by [`Effect::Fetch`] is in the node's cache (and stays while a queued job names it).
     ContentReady(ContentHash),
-    /// The cache made room: it does not have this content any more.
-    ContentEvicted(ContentHash),
+    /// The cache does not have these contents any more.
+    ContentsEvicted(Vec<ContentHash>),
     /// The cache's figures changed.
     CacheCounted(CacheFigures),
     /// A content could not be had.
@@ -203,7 +203,7 @@ pub enum Effect {
     /// No queued job names this content any more; the cache may evict it.
     Release(ContentHash),
     /// Drop these contents from the cache where they are not pinned, all such if none is named; answer with
-    /// `ContentEvicted` for each that is gone.
+    /// `ContentsEvicted`.
     Evict(Vec<ContentHash>),
     /// Drained, goodbye said: the process may end.
     Exit,
@@ -298,7 +298,7 @@ impl WorkerMachine {
             Event::FromApp { link, message } => self.app_said(now, link, message),
             Event::AppLinkClosed { link } => self.app_link_closed(now, link),
             Event::ContentReady(content) => self.content_ready(content),
-            Event::ContentEvicted(content) => self.content_evicted(content),
+            Event::ContentsEvicted(contents) => self.contents_evicted(contents),
             Event::CacheCounted(figures) => self.cache = figures,
             Event::ContentFailed { content, reason } => self.content_failed(now, content, &reason),
             Event::Started { job, device } | Event::Resumed { job, device } => self.started(now, job, device),

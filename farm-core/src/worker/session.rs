@@ -104,7 +104,7 @@ impl WorkerMachine {
             sequence: self.heartbeat_sequence,
             devices,
             spool_bytes: self.spool_bytes,
-            cache: self.cache,
+            cache: Some(self.cache),
         });
         self.reports.heartbeat_said(self.heartbeat_sequence);
     }

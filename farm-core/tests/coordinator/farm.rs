@@ -169,7 +169,7 @@ impl Farm {
             sequence: 1,
             devices,
             spool_bytes: 0,
-            cache: CacheFigures::default(),
+            cache: Some(CacheFigures::default()),
         };
         self.handle(Event::FromNode { link: LinkId(node), message })
     }

@@ -72,7 +72,7 @@ fn what_the_cache_holds_is_not_asked_for_until_it_is_evicted() {
     assert_eq!((asked(&node), node.fetches.len()), (1, 2), "the driver finds it in its cache");
     node.tell(Event::ContentReady(LARGE.hash));
     assert_eq!(told_of_cache(&mut node), [held()], "told once");
-    node.tell(Event::ContentEvicted(LARGE.hash));
+    node.tell(Event::ContentsEvicted(vec![LARGE.hash]));
     assert_eq!(told_of_cache(&mut node), [gone()]);
 }
 

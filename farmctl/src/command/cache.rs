@@ -146,7 +146,7 @@ fn resolve(prefix: &str, known: &ContentsStatus) -> Result<ContentHash, Failure>
     match (found.next(), found.next()) {
         (Some(one), None) => Ok(one.content.hash),
         (None, _) => Err(Failure::Work(anyhow::anyhow!(
-            "no content {prefix}... is cached; `farmctl cache ls` lists them"
+            "no content {prefix}... is listed; `farmctl cache ls` shows those that can be named"
         ))),
         (Some(_), Some(_)) => Err(usage(format!("{prefix}... names several contents: say more digits"))),
     }

@@ -237,7 +237,10 @@ impl DeviceThread {
                 catch_unwind(AssertUnwindSafe(|| prepare(gpu, caches, &order, self.host.as_ref())))
                     .unwrap_or_else(|panic| Err(JobFailure::InvalidProgram(panic_text(panic.as_ref()))));
             match prepared {
-                Ok(prepared) => self.state.staged.push((order, prepared)),
+                Ok(prepared) => {
+                    self.state.staged.push((order, prepared));
+                    self.host.prepared(job);
+                }
                 Err(failure) => self.finished(job, 0, Err(failure)),
             }
             self.hand_over();

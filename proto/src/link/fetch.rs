@@ -138,7 +138,7 @@ async fn answer_fetch(
     request.read_exact(&mut asked).await.map_err(|error| error.to_string())?;
     let mut hash = [0; 32];
     hash.copy_from_slice(&asked[..32]);
-    let found = source.get(ContentHash(hash)).await;
+    let (found, _room) = source.get(ContentHash(hash)).await.unzip();
     let mut head = BytesMut::with_capacity(ANSWER_BYTES);
     head.put_u8(if found.is_some() { FOUND } else { NOT_FOUND });
     head.put_u64_le(found.as_ref().map_or(0, |bytes| bytes.len() as u64));

@@ -24,6 +24,7 @@ use bytes::Bytes;
 use farm_core::id::ContentHash;
 use serde::{Serialize, de::DeserializeOwned};
 use thiserror::Error;
+use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 
 pub use self::{
     connect::{BindError, CONNECT_TIMEOUT, ConnectError, DataServer, Incoming, MAX_LINKS, connect},
@@ -75,8 +76,11 @@ pub struct Link<S, R> {
 #[derive(Clone)]
 pub struct ContentSource {
     at_hand: Lookup,
-    stored: Option<Lookup>,
+    stored: Option<(Lookup, Arc<Semaphore>)>,
 }
+
+/// Contents that were read from storage for others, and are not sent yet; each is in memory whole.
+const STORED_AT_ONCE: usize = 4;
 
 type Lookup = Arc<dyn Fn(ContentHash) -> Option<Bytes> + Send + Sync>;
 
@@ -86,10 +90,11 @@ impl ContentSource {
         Self { at_hand: Arc::new(lookup), stored: None }
     }
 
-    /// Where that has nothing, `lookup` is asked, which may block: it is called on a thread for that.
+    /// Where that has nothing, `lookup` is asked, which may block: it is called on a thread for that. Four answers of it are in
+    /// memory at once; further ones wait until one is sent.
     #[must_use]
     pub fn or_stored(self, lookup: impl Fn(ContentHash) -> Option<Bytes> + Send + Sync + 'static) -> Self {
-        Self { stored: Some(Arc::new(lookup)), ..self }
+        Self { stored: Some((Arc::new(lookup), Arc::new(Semaphore::new(STORED_AT_ONCE)))), ..self }
     }
 
     /// A source that has nothing.
@@ -98,13 +103,16 @@ impl ContentSource {
         Self::new(|_| None)
     }
 
-    async fn get(&self, hash: ContentHash) -> Option<Bytes> {
+    /// The bytes, and what to keep until they are sent.
+    async fn get(&self, hash: ContentHash) -> Option<(Bytes, Option<OwnedSemaphorePermit>)> {
         if let Some(bytes) = (self.at_hand)(hash) {
-            return Some(bytes);
+            return Some((bytes, None));
         }
-        let stored = Arc::clone(self.stored.as_ref()?);
+        let (stored, room) = self.stored.as_ref()?;
+        let (stored, permit) = (Arc::clone(stored), Arc::clone(room).acquire_owned().await.ok()?);
         // A runtime that ends answers nothing any more.
-        tokio::task::spawn_blocking(move || stored(hash)).await.ok().flatten()
+        let bytes = tokio::task::spawn_blocking(move || stored(hash)).await.ok().flatten()?;
+        Some((bytes, Some(permit)))
     }
 }
 

@@ -170,7 +170,9 @@ impl Folder {
     pub(super) fn write(&self, hash: &ContentHash, bytes: &[u8]) -> io::Result<()> {
         static NEXT: AtomicU64 = AtomicU64::new(0);
         let number = NEXT.fetch_add(1, Ordering::Relaxed);
-        let unfinished = self.0.join(format!("{UNFINISHED}{}-{number}", std::process::id()));
+        // Process ids alone repeat: in containers each is 1.
+        let now = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default().as_nanos();
+        let unfinished = self.0.join(format!("{UNFINISHED}{}-{now}-{number}", std::process::id()));
         let written = fs::write(&unfinished, bytes).and_then(|()| fs::rename(&unfinished, self.path(hash)));
         if written.is_err() {
             // A full disk must not keep half a file; one that is not there is as good.

@@ -91,9 +91,12 @@ impl MemoryCache {
         }
     }
 
-    /// Drops contents that are not pinned, all such if none is named; `evicted` is told of each.
-    pub(super) fn evict(&mut self, named: &[ContentHash], mut evicted: impl FnMut(ContentHash)) {
-        let is_named = |hash: &ContentHash| named.is_empty() || named.contains(hash);
+    /// Drops those that are named and not pinned; `evicted` is told of each.
+    pub(super) fn evict(
+        &mut self,
+        is_named: impl Fn(&ContentHash) -> bool,
+        mut evicted: impl FnMut(ContentHash),
+    ) {
         let idle: Vec<u64> = self.idle.iter().filter(|(_, hash)| is_named(hash)).map(|(&at, _)| at).collect();
         for at in idle {
             if let Some(hash) = self.idle.remove(&at) {

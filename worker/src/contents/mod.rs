@@ -4,7 +4,11 @@
 mod disk;
 mod memory;
 
-use std::{collections::HashMap, io, path::Path};
+use std::{
+    collections::{BTreeSet, HashMap},
+    io,
+    path::Path,
+};
 
 use bytes::Bytes;
 use farm_core::{id::ContentHash, message::CacheFigures, program::Content, worker::Event};
@@ -18,6 +22,9 @@ use self::{
 };
 use crate::driver::Input;
 
+/// Most bytes on their way to disk: memory beyond the cache's cap. What comes faster than the disk writes is not kept there.
+const MAX_WRITING_BYTES: u64 = 4 << 30;
+
 /// What is kept, and what is on its way.
 #[derive(Debug)]
 pub(crate) struct Contents {
@@ -25,6 +32,8 @@ pub(crate) struct Contents {
     disk: Option<DiskCache>,
     /// Fetches on the way, and whether the machine still waits for them.
     fetching: HashMap<ContentHash, bool>,
+    /// Bytes on their way to disk.
+    writing_bytes: u64,
     figures: CacheFigures,
     /// What the machine was told last.
     told: CacheFigures,
@@ -52,6 +61,7 @@ impl Contents {
             memory: MemoryCache::new(memory_cap_bytes),
             disk,
             fetching: HashMap::new(),
+            writing_bytes: 0,
             figures: CacheFigures::default(),
             told: CacheFigures::default(),
         })
@@ -121,12 +131,13 @@ impl Contents {
     ) -> Vec<Event> {
         let hash = content.hash;
         let wanted = self.fetching.remove(&hash).unwrap_or(false);
-        if fetched.disk_failed
-            && let Some(disk) = &mut self.disk
-        {
-            disk.forget(&hash);
-        }
         let mut events = Vec::new();
+        if fetched.disk_failed
+            && self.disk.as_mut().is_some_and(|disk| disk.forget(&hash))
+            && !self.memory.has(&hash)
+        {
+            events.push(Event::ContentsEvicted(vec![hash]));
+        }
         let failure = match fetched.result {
             Ok(bytes) => {
                 if fetched.from_disk {
@@ -159,6 +170,7 @@ impl Contents {
     /// A content has been written to disk, or could not be: what the machine has to hear of what went for it.
     pub(crate) fn stored(&mut self, content: Content, result: io::Result<()>) -> Vec<Event> {
         let Some(disk) = &mut self.disk else { return Vec::new() };
+        self.writing_bytes -= content.size_bytes;
         if let Err(error) = result {
             tracing::warn!(content = %content.hash, %error, "a content cannot be kept on disk");
             return Vec::new();
@@ -166,15 +178,16 @@ impl Contents {
         let gone = disk.written(content);
         self.figures.disk_evictions += gone.len() as u64;
         remove(disk.folder(), gone.clone());
-        gone.into_iter().filter(|hash| !self.memory.has(hash)).map(Event::ContentEvicted).collect()
+        evicted(gone.into_iter().filter(|hash| !self.memory.has(hash)).collect())
     }
 
     /// Drops contents that no job needs, all such if none is named: what the machine has to hear of it.
     pub(crate) fn evict(&mut self, named: &[ContentHash]) -> Vec<Event> {
+        let named: BTreeSet<ContentHash> = named.iter().copied().collect();
+        let is_named = |hash: &ContentHash| named.is_empty() || named.contains(hash);
         let mut gone = Vec::new();
-        self.memory.evict(named, |hash| gone.push(hash));
+        self.memory.evict(is_named, |hash| gone.push(hash));
         if let Some(disk) = &mut self.disk {
-            let is_named = |hash: &ContentHash| named.is_empty() || named.contains(hash);
             let unneeded: Vec<ContentHash> = disk
                 .contents()
                 .map(|content| content.hash)
@@ -188,7 +201,7 @@ impl Contents {
         }
         gone.sort_unstable();
         gone.dedup();
-        gone.into_iter().map(Event::ContentEvicted).collect()
+        evicted(gone)
     }
 
     /// The figures, if they are others than those given last.
@@ -202,12 +215,11 @@ impl Contents {
     /// Puts bytes into memory, pinned; the reason, for people, if there is no room.
     fn take_in(&mut self, hash: ContentHash, bytes: Bytes, events: &mut Vec<Event>) -> Option<String> {
         let Self { memory, disk, figures, .. } = self;
-        let taken = memory.insert(hash, bytes, |evicted| {
-            figures.memory_evictions += 1;
-            if disk.as_ref().is_none_or(|disk| !disk.has(&evicted)) {
-                events.push(Event::ContentEvicted(evicted));
-            }
-        });
+        let mut gone = Vec::new();
+        let taken = memory.insert(hash, bytes, |hash| gone.push(hash));
+        figures.memory_evictions += gone.len() as u64;
+        gone.retain(|hash| disk.as_ref().is_none_or(|disk| !disk.has(hash)));
+        events.extend(evicted(gone));
         taken.err().map(|full| {
             format!(
                 "the content cache of {} B is full of contents in use ({} B)",
@@ -221,7 +233,8 @@ impl Contents {
         let Some(disk) = &mut self.disk else { return };
         if from_disk {
             disk.touch(&content.hash);
-        } else if disk.wants(&content) {
+        } else if disk.wants(&content) && self.writing_bytes + content.size_bytes <= MAX_WRITING_BYTES {
+            self.writing_bytes += content.size_bytes;
             let (folder, bytes, inputs) = (disk.folder(), bytes.clone(), inputs.clone());
             tokio::spawn(async move {
                 let write = move || folder.write(&content.hash, &bytes);
@@ -231,6 +244,11 @@ impl Contents {
             });
         }
     }
+}
+
+/// What the machine hears of contents that are gone.
+fn evicted(gone: Vec<ContentHash>) -> Vec<Event> {
+    if gone.is_empty() { Vec::new() } else { vec![Event::ContentsEvicted(gone)] }
 }
 
 /// Reads a content from disk; `None` if it is not what it should be.

@@ -4,7 +4,10 @@
 //! A task owns the process and a [`Book`] of what it holds; it starts the process anew when it ends, and ends it when it
 //! hangs. The process itself is [`super::serve`]. A new one measures its device again before it takes jobs.
 
-use std::{path::PathBuf, time::Instant};
+use std::{
+    path::PathBuf,
+    time::{Duration, Instant},
+};
 
 use bytes::Bytes;
 use farm_core::{
@@ -13,11 +16,11 @@ use farm_core::{
     message::JobFailure,
 };
 use gpu_exec::DeviceSpec;
-use tokio::sync::mpsc;
+use tokio::{sync::mpsc, time::timeout};
 
 use super::{
     Order,
-    book::{Aborted, Book},
+    book::{Aborted, Book, Victim},
     process::{NotOpen, Process},
     restarts::Restarts,
     wire::{FromExecutor, ToExecutor},
@@ -26,6 +29,9 @@ use crate::{
     contents::Shelf,
     device::{DeviceEvent, DeviceNews, Payload},
 };
+
+/// How long a process that seems hung is listened to once more.
+const LAST_LOOK: Duration = Duration::from_millis(500);
 
 /// How an executor process is started.
 #[derive(Clone, Debug)]
@@ -64,17 +70,19 @@ impl ExecutorProcess {
         let supervisor = Supervisor {
             launch,
             index,
+            info: info.clone(),
             contents,
             events,
             book: Book::new(Instant::now()),
             restarts: Restarts::default(),
+            fault_told: false,
         };
         // Ends when the handle is dropped.
         tokio::spawn(supervisor.run(process, received));
         Ok((Self { commands }, info))
     }
 
-    /// Takes an order. One whose device is lost is dropped: the machine has heard of the loss, or will.
+    /// Takes an order; what becomes of it comes as an event.
     pub(super) fn submit(&self, order: Order) {
         let _ = self.commands.send(Command::Execute(order));
     }
@@ -89,10 +97,14 @@ impl ExecutorProcess {
 struct Supervisor {
     launch: Launch,
     index: DeviceIndex,
+    /// As it was opened first: what the farm knows of it.
+    info: DeviceInfo,
     contents: Shelf,
     events: mpsc::UnboundedSender<DeviceEvent>,
     book: Book,
     restarts: Restarts,
+    /// The last that the process said was that a job failed: if its device is lost now, that was why.
+    fault_told: bool,
 }
 
 /// Why a process is of no more use.
@@ -112,7 +124,7 @@ impl Supervisor {
         let mut process = first;
         loop {
             let end = self.attend(&mut process, &mut commands).await;
-            let blamed = matches!(end, End::DeviceLost(_));
+            let blamed = self.fault_told && matches!(end, End::DeviceLost(_));
             let reason = match end {
                 End::Closed => return,
                 End::Broken(words) => format!("the device's executor {}; {words}", process.ended().await),
@@ -138,7 +150,7 @@ impl Supervisor {
         commands: &mut mpsc::UnboundedReceiver<Command>,
     ) -> End {
         loop {
-            while let Some(order) = self.book.next() {
+            while let Some(order) = self.book.next(Instant::now()) {
                 process.execute(order);
             }
             let deadline = self.book.deadline();
@@ -167,15 +179,27 @@ impl Supervisor {
                     }
                     None => return End::Closed,
                 },
-                () = silence => return End::Hung,
+                // Whoever was stopped itself, as by a debugger, finds the words of a process that was not.
+                () = silence => match timeout(LAST_LOOK, process.said()).await {
+                    Ok(Ok((header, payload))) => {
+                        if let Some(end) = self.heard(process, header, payload) {
+                            return end;
+                        }
+                    }
+                    Ok(Err(error)) => return End::Broken(error),
+                    Err(_) => return End::Hung,
+                },
             }
         }
     }
 
     fn heard(&mut self, process: &Process, header: FromExecutor, payload: Bytes) -> Option<End> {
         let now = Instant::now();
+        let fault_told = matches!(&header, FromExecutor::Finished { outcome: Err(_), .. });
+        let fault_told = std::mem::replace(&mut self.fault_told, fault_told);
         match header {
             FromExecutor::Preparing(job) => self.book.preparing(now, job),
+            FromExecutor::Prepared(job) => self.book.prepared(now, job),
             FromExecutor::Started(job) => {
                 self.book.runs(now, job);
                 self.tell(DeviceNews::Started(job));
@@ -203,7 +227,10 @@ impl Supervisor {
                 let size_bytes = bytes.as_ref().map(|bytes| bytes.len() as u64);
                 process.send(&ToExecutor::Content { hash, size_bytes }, bytes);
             }
-            FromExecutor::Lost(reason) => return Some(End::DeviceLost(reason)),
+            FromExecutor::Lost(reason) => {
+                self.fault_told = fault_told;
+                return Some(End::DeviceLost(reason));
+            }
             FromExecutor::Opened(_) | FromExecutor::Refused(_) => {
                 return Some(End::Broken("it greeted twice".to_owned()));
             }
@@ -223,10 +250,12 @@ impl Supervisor {
         }
     }
 
-    /// Reports the jobs that ended with the process; whether there was one.
+    /// Reports the jobs that ended with the process; whether one of them was to blame.
     fn bury(&mut self, reason: &str) -> bool {
         let victims = self.book.lost(Instant::now(), reason);
-        let explained = !victims.is_empty();
+        // One that was taken back may be the cause if it was on the device.
+        let is_cause = |victim: &Victim| victim.failure != JobFailure::Cancelled || victim.device_time_ns > 0;
+        let explained = victims.iter().any(is_cause);
         for victim in victims {
             self.tell_failed(victim.job, victim.device_time_ns, victim.failure);
         }
@@ -261,7 +290,12 @@ impl Supervisor {
                 }
             };
             match opened {
-                Ok((process, _)) => return Ok(Some(process)),
+                Ok((process, info)) if is_same(&self.info, &info) => return Ok(Some(process)),
+                // `gpu:N` counts the devices that are there: one fewer, and a sibling answers.
+                Ok((_, other)) => {
+                    let reason = format!("{} answers in its place", other.name);
+                    rest = self.restarts.refused(reason)?;
+                }
                 Err(error) => rest = self.restarts.refused(error.reason())?,
             }
         }
@@ -269,10 +303,11 @@ impl Supervisor {
 
     /// The device is gone for good: every job on it and every one that still comes ends so.
     async fn lose(mut self, reason: String, mut commands: mpsc::UnboundedReceiver<Command>) {
+        // First, so that it gets no further jobs meanwhile.
+        self.tell(DeviceNews::Lost(reason.clone()));
         for job in self.book.clear() {
             self.tell_failed(job, 0, JobFailure::DeviceLost(reason.clone()));
         }
-        self.tell(DeviceNews::Lost(reason.clone()));
         while let Some(command) = commands.recv().await {
             if let Command::Execute(order) = command {
                 self.tell_failed(order.job, 0, JobFailure::DeviceLost(reason.clone()));
@@ -304,4 +339,9 @@ async fn first(launch: &Launch) -> Result<(Process, DeviceInfo), String> {
             }
         }
     }
+}
+
+/// Whether a device that was opened again is what the farm knows. Its score varies, and is that of the first time.
+fn is_same(known: &DeviceInfo, opened: &DeviceInfo) -> bool {
+    DeviceInfo { score: known.score, ..opened.clone() } == *known
 }

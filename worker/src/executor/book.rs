@@ -31,13 +31,15 @@ pub(super) struct Book {
 struct Held {
     order: Order,
     stage: Stage,
+    /// The process was told to give it up.
+    aborted: bool,
 }
 
 #[derive(Clone, Copy, Debug)]
 enum Stage {
     /// Not with the process yet.
     Waiting,
-    /// With the process.
+    /// With the process, staged or about to be prepared.
     Sent,
     /// Being compiled and uploaded.
     Preparing { since: Instant },
@@ -73,41 +75,44 @@ impl Book {
 
     /// A new order.
     pub(super) fn take(&mut self, order: Order) {
-        self.held.push_back(Held { order, stage: Stage::Waiting });
+        self.held.push_back(Held { order, stage: Stage::Waiting, aborted: false });
     }
 
     /// The next order for the process; it counts as sent.
-    pub(super) fn next(&mut self) -> Option<&Order> {
+    pub(super) fn next(&mut self, now: Instant) -> Option<&Order> {
         let suspect = self.suspect;
         let next = self.held.iter_mut().find(|held| {
             matches!(held.stage, Stage::Waiting) && suspect.is_none_or(|suspect| held.order.job == suspect)
         })?;
         next.stage = Stage::Sent;
+        // It has not been silent since: it had nothing to say.
+        self.heard = now;
         Some(&next.order)
     }
 
     pub(super) fn abort(&mut self, job: JobAttempt) -> Aborted {
-        match self.find(job).map(|held| held.stage) {
-            None => Aborted::Over,
-            Some(Stage::Waiting) => {
+        let Some(held) = self.find_mut(job) else { return Aborted::Over };
+        match held.stage {
+            Stage::Waiting => {
                 self.remove(job);
                 Aborted::Here
             }
-            Some(
-                Stage::Sent | Stage::Preparing { .. } | Stage::Running { .. } | Stage::Interrupted { .. },
-            ) => Aborted::There,
+            Stage::Sent | Stage::Preparing { .. } | Stage::Running { .. } | Stage::Interrupted { .. } => {
+                held.aborted = true;
+                Aborted::There
+            }
         }
     }
 
     pub(super) fn preparing(&mut self, now: Instant, job: JobAttempt) {
         self.heard = now;
-        // One at a time: what was prepared before is staged.
-        for held in &mut self.held {
-            if matches!(held.stage, Stage::Preparing { .. }) {
-                held.stage = Stage::Sent;
-            }
-        }
         self.set(job, Stage::Preparing { since: now });
+    }
+
+    pub(super) fn prepared(&mut self, now: Instant, job: JobAttempt) {
+        self.heard = now;
+        self.cleared(job);
+        self.set(job, Stage::Sent);
     }
 
     /// It runs, for the first time or again.
@@ -140,20 +145,30 @@ impl Book {
         let overdue: Vec<JobAttempt> = self.those(|held| self.deadline_of(held).is_some_and(|at| at <= now));
         let on_device = |held: &Held| matches!(held.stage, Stage::Running { .. } | Stage::Interrupted { .. });
         let mut victims = self.those(on_device);
+        let idle = victims.is_empty();
         self.suspect = None;
         // At most one is prepared. With nothing on the device it was this one; else it is one of two.
         for job in self.those(|held| matches!(held.stage, Stage::Preparing { .. })) {
-            if victims.is_empty() || overdue.contains(&job) {
+            if idle || overdue.contains(&job) {
                 victims.push(job);
             } else {
                 self.suspect = Some(job);
             }
         }
+        // It was never taken up, the first of them at least.
+        let stuck = self.those(|held| matches!(held.stage, Stage::Sent)).into_iter();
+        victims.extend(stuck.filter(|job| overdue.contains(job)).take(usize::from(victims.is_empty())));
+        // Nobody wants them any more: they do not start over.
+        let given_up = self.those(|held| held.aborted);
+        self.suspect.take_if(|suspect| given_up.contains(suspect));
+        victims.extend(given_up.iter().copied().filter(|job| !victims.contains(job)).collect::<Vec<_>>());
         let victims: Vec<Victim> = victims
             .into_iter()
             .filter_map(|job| {
                 let held = self.find(job)?;
-                let failure = if overdue.contains(&job) {
+                let failure = if held.aborted {
+                    JobFailure::Cancelled
+                } else if overdue.contains(&job) {
                     JobFailure::Timeout
                 } else {
                     JobFailure::DeviceLost(reason.to_owned())
@@ -180,16 +195,23 @@ impl Book {
 
     fn deadline_of(&self, held: &Held) -> Option<Instant> {
         match held.stage {
-            Stage::Running { since, ran } => Some(since + held.order.limit.saturating_sub(ran) + GRACE),
             Stage::Preparing { since } => Some(since + PREPARATION_LIMIT),
+            // The device's thread compiles: it ends the running job when it is done with that.
+            Stage::Running { .. } if self.has(|stage| matches!(stage, Stage::Preparing { .. })) => None,
+            Stage::Running { since, ran } => {
+                let due = since + held.order.limit.saturating_sub(ran);
+                Some(due.max(self.heard) + GRACE)
+            }
             // Behind another one it may wait as long as that takes.
-            Stage::Sent if !self.is_busy() => Some(self.heard + PREPARATION_LIMIT),
+            Stage::Sent | Stage::Interrupted { .. } if !self.has(Stage::is_at_work) => {
+                Some(self.heard + PREPARATION_LIMIT)
+            }
             Stage::Sent | Stage::Waiting | Stage::Interrupted { .. } => None,
         }
     }
 
-    fn is_busy(&self) -> bool {
-        self.held.iter().any(|held| matches!(held.stage, Stage::Running { .. } | Stage::Preparing { .. }))
+    fn has(&self, wanted: impl Fn(&Stage) -> bool) -> bool {
+        self.held.iter().any(|held| wanted(&held.stage))
     }
 
     /// The job has come further than where a suspect falls.
@@ -205,17 +227,26 @@ impl Book {
         self.held.iter().find(|held| held.order.job == job)
     }
 
+    fn find_mut(&mut self, job: JobAttempt) -> Option<&mut Held> {
+        self.held.iter_mut().find(|held| held.order.job == job)
+    }
+
     fn set(&mut self, job: JobAttempt, stage: Stage) {
-        if let Some(held) = self.held.iter_mut().find(|held| held.order.job == job) {
+        if let Some(held) = self.find_mut(job) {
             held.stage = stage;
         }
     }
 
     fn remove(&mut self, job: JobAttempt) -> bool {
         self.cleared(job);
-        let before = self.held.len();
-        self.held.retain(|held| held.order.job != job);
-        self.held.len() < before
+        let position = self.held.iter().position(|held| held.order.job == job);
+        position.is_some_and(|position| self.held.remove(position).is_some())
+    }
+}
+
+impl Stage {
+    const fn is_at_work(&self) -> bool {
+        matches!(self, Self::Running { .. } | Self::Preparing { .. })
     }
 }
 
@@ -255,14 +286,14 @@ mod tests {
             book.take(Order { job: job(index), class, program, limit: LIMIT });
         }
         for index in 0..jobs {
-            assert_eq!(next(&mut book), Some(job(index)), "in the order of arrival");
+            assert_eq!(next(&mut book, now), Some(job(index)), "in the order of arrival");
         }
-        assert_eq!(next(&mut book), None, "each once");
+        assert_eq!(next(&mut book, now), None, "each once");
         book
     }
 
-    fn next(book: &mut Book) -> Option<JobAttempt> {
-        book.next().map(|order| order.job)
+    fn next(book: &mut Book, now: Instant) -> Option<JobAttempt> {
+        book.next(now).map(|order| order.job)
     }
 
     fn crashed(job: JobAttempt, device_time_ns: u64) -> Victim {
@@ -279,8 +310,8 @@ mod tests {
         book.runs(start + Duration::from_secs(1), job(1));
         let victims = book.lost(start + Duration::from_secs(3), "crash");
         assert_eq!(victims, [crashed(job(0), 1_000_000_000), crashed(job(1), 2_000_000_000)]);
-        assert_eq!(next(&mut book), Some(job(2)));
-        assert_eq!(next(&mut book), None);
+        assert_eq!(next(&mut book, start), Some(job(2)));
+        assert_eq!(next(&mut book, start), None);
     }
 
     #[test]
@@ -289,7 +320,7 @@ mod tests {
         let mut book = sent(start, 2);
         book.preparing(start, job(0));
         assert_eq!(book.lost(start, "crash"), [crashed(job(0), 0)]);
-        assert_eq!(next(&mut book), Some(job(1)));
+        assert_eq!(next(&mut book, start), Some(job(1)));
     }
 
     #[test]
@@ -299,23 +330,23 @@ mod tests {
         book.runs(start, job(0));
         book.preparing(start, job(2));
         assert_eq!(book.lost(start, "crash"), [crashed(job(0), 0)]);
-        assert_eq!(next(&mut book), Some(job(2)), "alone");
-        assert_eq!(next(&mut book), None, "nothing goes with it");
+        assert_eq!(next(&mut book, start), Some(job(2)), "alone");
+        assert_eq!(next(&mut book, start), None, "nothing goes with it");
         book.preparing(start, job(2));
         let mut innocent = book.lost(start, "crash");
         assert_eq!(innocent.pop(), Some(crashed(job(2), 0)), "it was this one");
-        assert_eq!((innocent.len(), next(&mut book)), (0, Some(job(1))));
+        assert_eq!((innocent.len(), next(&mut book, start)), (0, Some(job(1))));
     }
 
     #[test]
     fn a_suspect_is_cleared_when_it_starts_ends_or_is_taken_back() {
         let clear: [fn(&mut Book, Instant); 3] = [
             |book, now| {
-                next(book);
+                next(book, now);
                 book.runs(now, job(1));
             },
             |book, now| {
-                next(book);
+                next(book, now);
                 assert!(book.finished(now, job(1)), "it was here");
             },
             |book, _| assert_eq!(book.abort(job(1)), Aborted::Here, "it had not been sent again"),
@@ -327,7 +358,7 @@ mod tests {
             book.preparing(start, job(1));
             book.lost(start, "crash");
             clear(&mut book, start);
-            assert_eq!(next(&mut book), Some(job(2)), "the others go on");
+            assert_eq!(next(&mut book, start), Some(job(2)), "the others go on");
         }
     }
 
@@ -347,16 +378,69 @@ mod tests {
         assert_eq!(victims[0].failure, JobFailure::Timeout);
     }
 
+    fn timed_out(job: JobAttempt) -> Victim {
+        Victim { job, device_time_ns: 0, failure: JobFailure::Timeout }
+    }
+
     #[test]
-    fn a_job_that_is_never_taken_up_times_out_too() {
+    fn a_job_that_is_never_taken_up_or_never_prepared_times_out_too() {
         let start = Instant::now();
-        let mut book = sent(start, 2);
-        let deadline = book.deadline().expect("nothing is heard of the first");
-        assert_eq!(deadline, start + PREPARATION_LIMIT);
-        book.preparing(start, job(0));
         let later = start + PREPARATION_LIMIT;
+        let mut book = sent(start, 2);
+        assert_eq!(book.deadline(), Some(later), "nothing is heard of the first");
+        assert_eq!(book.lost(later, "hung"), [timed_out(job(0))], "the second may be innocent");
+        let mut book = sent(start, 2);
+        book.preparing(start, job(1));
         assert_eq!(book.deadline(), Some(later));
-        let victims = book.lost(later, "hung");
-        assert_eq!(victims, [Victim { job: job(0), device_time_ns: 0, failure: JobFailure::Timeout }]);
+        assert_eq!(book.lost(later, "hung"), [timed_out(job(1))]);
+    }
+
+    /// Found by reading: the first order after two idle minutes was taken for two minutes of silence.
+    #[test]
+    fn a_process_without_a_job_is_not_silent() {
+        let start = Instant::now();
+        let later = start + Duration::from_secs(600);
+        let mut book = sent(later, 1);
+        book.heard = start;
+        assert!(book.finished(start, job(0)), "it was here");
+        book.take(sent(start, 1).held.remove(0).expect("one").order);
+        assert_eq!(next(&mut book, later), Some(job(0)));
+        assert_eq!(book.deadline(), Some(later + PREPARATION_LIMIT));
+    }
+
+    /// Found by reading: a job that was staged for long counted as being prepared for long, and as a suspect.
+    #[test]
+    fn a_staged_job_is_neither_late_nor_a_suspect() {
+        let start = Instant::now();
+        let at = |seconds| start + Duration::from_secs(seconds);
+        let mut book = sent(start, 2);
+        book.runs(start, job(0));
+        book.preparing(start, job(1));
+        assert_eq!(
+            book.deadline(),
+            Some(start + PREPARATION_LIMIT),
+            "the thread compiles: the limit can wait"
+        );
+        book.prepared(at(60), job(1));
+        assert_eq!(book.deadline(), Some(at(60) + GRACE), "the running one is over its limit");
+        assert!(book.finished(at(60), job(0)), "the process ends it itself, and then is lost");
+        assert_eq!(book.lost(at(60), "hung"), [], "the staged one is nobody's victim");
+        assert_eq!(next(&mut book, at(60)), Some(job(1)));
+    }
+
+    /// Found by reading: a job that was taken back before its process died ran to its end in the next one.
+    #[test]
+    fn what_was_taken_back_does_not_start_over() {
+        let start = Instant::now();
+        let mut book = sent(start, 3);
+        book.runs(start, job(0));
+        book.preparing(start, job(1));
+        for index in 0..3 {
+            assert_eq!(book.abort(job(index)), Aborted::There);
+        }
+        let victims: Vec<JobFailure> =
+            book.lost(start, "crash").into_iter().map(|victim| victim.failure).collect();
+        assert_eq!(victims, vec![JobFailure::Cancelled; 3]);
+        assert_eq!((next(&mut book, start), book.abort(job(1))), (None, Aborted::Over));
     }
 }

@@ -86,7 +86,7 @@ impl Process {
         let (reads, writes) = UnixStream::from_std(ours).map_err(failed)?.into_split();
         let (saying, said) = mpsc::channel(QUEUED_MESSAGES);
         let (outbox, outgoing) = mpsc::unbounded_channel();
-        // Both end with the process, or with this.
+        // Both end with the process.
         tokio::spawn(read(reads, saying));
         tokio::spawn(write(writes, outgoing));
         let mut process = Self { child, said, outbox };

@@ -7,11 +7,12 @@ use std::{
 
 /// Rests before the device is opened anew; as many tries as there are rests.
 const RESTS: [Duration; 3] = [Duration::ZERO, Duration::from_secs(1), Duration::from_secs(5)];
-/// Ends without a job to blame that a device may have within [`WINDOW`]; with one more it is lost. A device on which one job
+/// Ends without a job to blame that a device may have within [`WINDOW`]; with one more it is lost. The window holds as many
+/// processes that are silent for as long as they may be. A device on which one job
 /// after the other crashes is another matter: those may be poison, and each new process measures the device.
 const MAX_UNEXPLAINED: usize = 3;
 /// How long an end without a job to blame counts.
-const WINDOW: Duration = Duration::from_secs(300);
+const WINDOW: Duration = Duration::from_secs(900);
 
 /// The ends of one device's executors.
 #[derive(Debug, Default)]
@@ -75,7 +76,7 @@ mod tests {
     }
 
     #[test]
-    fn ends_count_only_without_a_job_to_blame_and_for_five_minutes() {
+    fn ends_count_only_without_a_job_to_blame_and_for_a_while() {
         let mut restarts = Restarts::default();
         let now = Instant::now();
         for _ in 0..100 {

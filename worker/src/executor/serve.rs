@@ -1,11 +1,16 @@
 //! The executor process itself: one device, orders in from the socket that is its standard input, news out on it.
 
 use std::{
-    collections::HashMap,
     io::{self, Read as _, Write as _},
-    os::{fd::AsFd as _, unix::net::UnixStream},
+    os::{
+        fd::AsFd as _,
+        unix::{net::UnixStream, process::parent_id},
+    },
     process::ExitCode,
-    sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError},
+    sync::{
+        Arc, Condvar, Mutex, MutexGuard, PoisonError,
+        atomic::{AtomicBool, Ordering},
+    },
     thread,
     time::Duration,
 };
@@ -15,7 +20,7 @@ use farm_core::{
     id::{ContentHash, JobAttempt},
     message::JobFailure,
 };
-use gpu_exec::{DeviceSpec, Executor, ExecutorConfig, ExecutorEvent, Host, HungDevice, Order};
+use gpu_exec::{Busy, DeviceSpec, Executor, ExecutorConfig, ExecutorEvent, Host, HungDevice, Order};
 use proto::codec;
 
 use super::wire::{self, FromExecutor, Header as _, LENGTH_BYTES, Output, ToExecutor};
@@ -25,6 +30,8 @@ use crate::device::Payload;
 const CONTENT_WAIT: Duration = Duration::from_secs(60);
 /// How long the end of the process may take, drivers' clean-up included.
 const ENDING_LIMIT: Duration = Duration::from_secs(3);
+/// Pause between two looks for the parent.
+const PARENT_LOOKS: Duration = Duration::from_secs(1);
 /// Exit code where there is no worker at the other end.
 const EXIT_USAGE: u8 = 2;
 
@@ -34,13 +41,12 @@ pub(super) fn serve(spec: &str) -> ExitCode {
         return ExitCode::from(EXIT_USAGE);
     };
     let line =
-        Arc::new(Line { socket, writing: Mutex::default(), arrived: Mutex::default(), news: Condvar::new() });
-    match run(spec, &line) {
-        Ok(()) => {
-            end_soon();
-            ExitCode::SUCCESS
-        }
-        // The worker was gone before the device was open.
+        Arc::new(Line { socket, writing: Mutex::default(), wish: Mutex::default(), news: Condvar::new() });
+    let done = run(spec, &line);
+    end_soon();
+    match done {
+        Ok(()) => ExitCode::SUCCESS,
+        // The worker was gone before the device was open, or before it heard something.
         Err(error) if error.kind() == io::ErrorKind::BrokenPipe => ExitCode::SUCCESS,
         Err(error) => {
             // Whoever started this by hand reads it.
@@ -52,10 +58,12 @@ pub(super) fn serve(spec: &str) -> ExitCode {
 
 fn run(spec: &str, line: &Arc<Line>) -> io::Result<()> {
     let config = ExecutorConfig { hung_device: HungDevice::Lost, ..ExecutorConfig::default() };
+    let open = end_with_parent();
     let opened = spec.parse::<DeviceSpec>().map_err(|error| error.to_string()).and_then(|spec| {
         let host = Speaker(Arc::clone(line));
         Executor::start(&spec, config, host).map_err(|error| error.to_string())
     });
+    open.store(true, Ordering::Relaxed);
     let executor = match opened {
         Ok(executor) => executor,
         Err(reason) => return line.say(&FromExecutor::Refused(reason), &[]),
@@ -76,8 +84,11 @@ fn take(executor: &Executor, line: &Line, header: ToExecutor, payload: Bytes) ->
             let failure = match codec::decode_program(&payload) {
                 Ok(program) => {
                     let order = Order { job, class, program: Arc::new(program), contents: Vec::new(), limit };
-                    let busy = executor.submit(order).err();
-                    busy.map(|busy| JobFailure::DeviceLost(busy.to_string()))
+                    match executor.submit(order) {
+                        // A lost device is the end of this process; what had not begun is tried in the next one.
+                        Ok(()) | Err(Busy::Lost { .. }) => None,
+                        Err(full @ Busy::Full { .. }) => Some(JobFailure::DeviceLost(full.to_string())),
+                    }
                 }
                 Err(error) => Some(JobFailure::InvalidProgram(error.to_string())),
             };
@@ -91,11 +102,31 @@ fn take(executor: &Executor, line: &Line, header: ToExecutor, payload: Bytes) ->
             Ok(())
         }
         ToExecutor::Content { hash, size_bytes } => {
-            line.arrived().insert(hash, size_bytes.map(|_| payload));
-            line.news.notify_all();
+            // One that comes too late is wished for no more.
+            if let Some(wish) = line.wish().as_mut().filter(|wish| wish.hash == hash) {
+                wish.answer = Some(size_bytes.map(|_| payload));
+                line.news.notify_all();
+            }
             Ok(())
         }
     }
+}
+
+/// Until the device is open nobody reads the socket: a worker that ends meanwhile is noticed by its being the parent no more.
+/// Ends when told that the device is open.
+fn end_with_parent() -> Arc<AtomicBool> {
+    let (open, parent) = (Arc::new(AtomicBool::new(false)), parent_id());
+    let told = Arc::clone(&open);
+    // Without a thread a driver that hangs keeps the process: no more than that.
+    let _ = thread::Builder::new().spawn(move || {
+        while !told.load(Ordering::Relaxed) {
+            thread::sleep(PARENT_LOOKS);
+            if parent_id() != parent {
+                std::process::abort();
+            }
+        }
+    });
+    open
 }
 
 /// A driver that does not come to its end does not keep the process.
@@ -112,10 +143,16 @@ struct Line {
     socket: UnixStream,
     /// One message at a time: the device's thread writes, and the one that reads.
     writing: Mutex<()>,
-    /// Contents that came and were not taken yet. A lock and a signal: the device's thread waits in the middle of a job's
-    /// preparation.
-    arrived: Mutex<HashMap<ContentHash, Option<Bytes>>>,
+    /// The content that the device's thread waits for, in the middle of a job's preparation: hence a lock and a signal.
+    wish: Mutex<Option<Wish>>,
     news: Condvar,
+}
+
+/// A content that was asked for.
+struct Wish {
+    hash: ContentHash,
+    /// What came: the bytes, or that the worker has none.
+    answer: Option<Option<Bytes>>,
 }
 
 /// What the device tells, and asks of, the worker.
@@ -140,12 +177,17 @@ impl Host for Speaker {
         let _ = self.0.say(&FromExecutor::Preparing(job), &[]);
     }
 
+    fn prepared(&self, job: JobAttempt) {
+        let _ = self.0.say(&FromExecutor::Prepared(job), &[]);
+    }
+
     fn content(&self, hash: &ContentHash) -> Option<Bytes> {
+        *self.0.wish() = Some(Wish { hash: *hash, answer: None });
         self.0.say(&FromExecutor::Wants(*hash), &[]).ok()?;
-        let missing = |arrived: &mut HashMap<_, _>| !arrived.contains_key(hash);
-        let waited = self.0.news.wait_timeout_while(self.0.arrived(), CONTENT_WAIT, missing);
-        let (mut arrived, _) = waited.unwrap_or_else(PoisonError::into_inner);
-        arrived.remove(hash).flatten()
+        let open = |wish: &mut Option<Wish>| wish.as_ref().is_some_and(|wish| wish.answer.is_none());
+        let waited = self.0.news.wait_timeout_while(self.0.wish(), CONTENT_WAIT, open);
+        let (mut wish, _) = waited.unwrap_or_else(PoisonError::into_inner);
+        wish.take()?.answer.flatten()
     }
 }
 
@@ -190,7 +232,7 @@ impl Line {
         Ok((header, Bytes::from(payload)))
     }
 
-    fn arrived(&self) -> MutexGuard<'_, HashMap<ContentHash, Option<Bytes>>> {
-        self.arrived.lock().unwrap_or_else(PoisonError::into_inner)
+    fn wish(&self) -> MutexGuard<'_, Option<Wish>> {
+        self.wish.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }

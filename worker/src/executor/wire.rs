@@ -48,6 +48,8 @@ pub(super) enum FromExecutor {
     Refused(String),
     /// The job's modules are about to be compiled and its bytes uploaded.
     Preparing(JobAttempt),
+    /// They are.
+    Prepared(JobAttempt),
     /// As `gpu_exec::ExecutorEvent::Started`.
     Started(JobAttempt),
     /// As `gpu_exec::ExecutorEvent::Yielded`.
@@ -91,6 +93,7 @@ impl Header for FromExecutor {
             Self::Opened(_)
             | Self::Refused(_)
             | Self::Preparing(_)
+            | Self::Prepared(_)
             | Self::Started(_)
             | Self::Yielded(_)
             | Self::Resumed(_)

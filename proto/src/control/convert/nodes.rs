@@ -23,7 +23,7 @@ impl From<NodeToCoordinator> for v1::NodeToCoordinator {
             NodeToCoordinator::Hello(hello) => Message::Hello(hello.into()),
             NodeToCoordinator::Heartbeat { sequence, devices, spool_bytes, cache } => {
                 let devices = devices.into_iter().map(Into::into).collect();
-                let cache = Some(cache.into());
+                let cache = cache.map(Into::into);
                 Message::Heartbeat(v1::NodeHeartbeat { sequence, devices, spool_bytes, cache })
             }
             NodeToCoordinator::Report { sent_at, executed, delivered } => {
@@ -69,8 +69,7 @@ impl TryFrom<v1::NodeToCoordinator> for NodeToCoordinator {
                         .map(TryInto::try_into)
                         .collect::<Result<_, WireError>>()?,
                     spool_bytes: heartbeat.spool_bytes,
-                    // A node of before this field.
-                    cache: heartbeat.cache.map(Into::into).unwrap_or_default(),
+                    cache: heartbeat.cache.map(Into::into),
                 }
             }
             Message::Report(report) => {

@@ -318,7 +318,7 @@ impl World {
             Effect::Release(content) => {
                 if self.rng.random_ratio(1, 2) && self.workers[index].cache.remove(&content) {
                     let life = self.workers[index].life;
-                    let event = Event::ContentEvicted(content);
+                    let event = Event::ContentsEvicted(vec![content]);
                     self.after(Duration::ZERO, Happening::Worker { worker: index, life, event });
                 }
             }
