@@ -187,6 +187,8 @@ async fn an_operator_has_contents_dropped() {
     farm.run(1).await;
     farm.run(2).await;
     on_disk(&folder, 2).await;
+    // Its first heartbeat says that it knows of evictions.
+    farm.figures("a", |figures| figures.disk_contents == 2).await;
     let held = farm.contents().await.contents;
     let (dropped, kept) = (held[0].content.hash, held[1].content.hash);
     control::evict(&farm.address(), None, Some(worker.info().node), &[dropped]).await.unwrap();

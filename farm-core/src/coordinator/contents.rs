@@ -252,7 +252,7 @@ impl CoordinatorMachine {
 
     /// Has nodes drop contents that no job needs; all nodes if none is named, all contents if none is.
     pub(super) fn evict(&mut self, node: Option<NodeId>, contents: &[ContentHash]) {
-        // A node of before this message would end its session over it.
+        // A node of before this message would end its session over it. One that joined a heartbeat ago has said nothing yet.
         let knows = |(id, known): (&NodeId, &Node)| known.cache.is_some().then_some(*id);
         let named = |id: &NodeId| node.is_none_or(|node| node == *id);
         let asked: Vec<NodeId> = self.nodes.iter().filter_map(knows).filter(named).collect();
