@@ -13,7 +13,10 @@ use super::Order;
 /// How long a job may take beyond its limit. The executor itself ends the job at its limit and gives a submit that is
 /// on the way two seconds; this is for one that cannot do even that.
 const GRACE: Duration = Duration::from_millis(2_500);
-/// How long compiling and uploading may take. A path tracer's kernels take some ten seconds on the slowest driver known.
+/// How long compiling and uploading may keep the device's thread from ending the job that runs. A path tracer's kernels take
+/// some ten seconds on the slowest driver known.
+const COMPILING: Duration = Duration::from_secs(20);
+/// How long compiling and uploading may take at all.
 const PREPARATION_LIMIT: Duration = Duration::from_secs(120);
 
 /// The jobs of one executor process.
@@ -196,22 +199,28 @@ impl Book {
     fn deadline_of(&self, held: &Held) -> Option<Instant> {
         match held.stage {
             Stage::Preparing { since } => Some(since + PREPARATION_LIMIT),
-            // The device's thread compiles: it ends the running job when it is done with that.
-            Stage::Running { .. } if self.has(|stage| matches!(stage, Stage::Preparing { .. })) => None,
             Stage::Running { since, ran } => {
                 let due = since + held.order.limit.saturating_sub(ran);
-                Some(due.max(self.heard) + GRACE)
+                let compiled = self.preparing_since().map_or(due, |since| since + COMPILING);
+                Some(due.max(self.heard).max(compiled) + GRACE)
             }
             // Behind another one it may wait as long as that takes.
-            Stage::Sent | Stage::Interrupted { .. } if !self.has(Stage::is_at_work) => {
+            Stage::Sent | Stage::Interrupted { .. } if !self.is_at_work() => {
                 Some(self.heard + PREPARATION_LIMIT)
             }
             Stage::Sent | Stage::Waiting | Stage::Interrupted { .. } => None,
         }
     }
 
-    fn has(&self, wanted: impl Fn(&Stage) -> bool) -> bool {
-        self.held.iter().any(|held| wanted(&held.stage))
+    fn is_at_work(&self) -> bool {
+        self.held.iter().any(|held| matches!(held.stage, Stage::Running { .. } | Stage::Preparing { .. }))
+    }
+
+    fn preparing_since(&self) -> Option<Instant> {
+        self.held.iter().find_map(|held| match held.stage {
+            Stage::Preparing { since } => Some(since),
+            Stage::Waiting | Stage::Sent | Stage::Running { .. } | Stage::Interrupted { .. } => None,
+        })
     }
 
     /// The job has come further than where a suspect falls.
@@ -241,12 +250,6 @@ impl Book {
         self.cleared(job);
         let position = self.held.iter().position(|held| held.order.job == job);
         position.is_some_and(|position| self.held.remove(position).is_some())
-    }
-}
-
-impl Stage {
-    const fn is_at_work(&self) -> bool {
-        matches!(self, Self::Running { .. } | Self::Preparing { .. })
     }
 }
 
@@ -416,11 +419,7 @@ mod tests {
         let mut book = sent(start, 2);
         book.runs(start, job(0));
         book.preparing(start, job(1));
-        assert_eq!(
-            book.deadline(),
-            Some(start + PREPARATION_LIMIT),
-            "the thread compiles: the limit can wait"
-        );
+        assert_eq!(book.deadline(), Some(start + COMPILING + GRACE), "the thread compiles: the limit waits");
         book.prepared(at(60), job(1));
         assert_eq!(book.deadline(), Some(at(60) + GRACE), "the running one is over its limit");
         assert!(book.finished(at(60), job(0)), "the process ends it itself, and then is lost");
