@@ -92,7 +92,7 @@ fn nodes_table(nodes: &[NodeStatus], wide: bool) -> String {
                 if device.lost { "lost" } else { state_word(node.state) }.to_owned(),
                 format!("{} {}", device.device.0, printable(&device.name)),
                 device.kind.to_string(),
-                format!("{:.0}", device.score),
+                score(device.score),
                 device.planned_jobs.saturating_sub(u64::from(device.running_jobs)).to_string(),
                 device.running_jobs.to_string(),
                 device.executed_jobs.to_string(),
@@ -131,6 +131,11 @@ const fn state_word(state: NodeState) -> &'static str {
         NodeState::Suspect => "suspect",
         NodeState::Draining => "draining",
     }
+}
+
+/// GFLOP/s; a software device has less than one.
+fn score(gflops: f64) -> String {
+    if gflops < 10.0 { format!("{gflops:.2}") } else { format!("{gflops:.0}") }
 }
 
 fn seconds(nanoseconds: u64) -> String {
