@@ -77,7 +77,7 @@ impl Listing {
         let nodes =
             nodes.into_iter().map(|node| NodeLine { node: node.node, name: node.name, cache: node.cache });
         let listed = contents.contents.into_iter().map(|held| ContentLine {
-            hash: hex(&held.content.hash),
+            hash: held.content.hash.to_string(),
             size_bytes: held.content.size_bytes,
             nodes: held.nodes,
         });
@@ -142,7 +142,7 @@ fn resolve(prefix: &str, known: &ContentsStatus) -> Result<ContentHash, Failure>
         )));
     }
     let prefix = prefix.to_ascii_lowercase();
-    let mut found = known.contents.iter().filter(|held| hex(&held.content.hash).starts_with(&prefix));
+    let mut found = known.contents.iter().filter(|held| held.content.hash.to_string().starts_with(&prefix));
     match (found.next(), found.next()) {
         (Some(one), None) => Ok(one.content.hash),
         (None, _) => Err(Failure::Work(anyhow::anyhow!(
@@ -150,10 +150,6 @@ fn resolve(prefix: &str, known: &ContentsStatus) -> Result<ContentHash, Failure>
         ))),
         (Some(_), Some(_)) => Err(usage(format!("{prefix}... names several contents: say more digits"))),
     }
-}
-
-fn hex(hash: &ContentHash) -> String {
-    hash.0.iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
 /// Bytes for people.

@@ -173,7 +173,10 @@ impl Folder {
         // Process ids alone repeat: in containers each is 1.
         let now = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default().as_nanos();
         let unfinished = self.0.join(format!("{UNFINISHED}{}-{now}-{number}", std::process::id()));
-        let written = fs::write(&unfinished, bytes).and_then(|()| fs::rename(&unfinished, self.path(hash)));
+        // By the same clock as reading: a file system's own lags behind it by some milliseconds.
+        let written = fs::write(&unfinished, bytes)
+            .and_then(|()| fs::File::open(&unfinished)?.set_modified(SystemTime::now()))
+            .and_then(|()| fs::rename(&unfinished, self.path(hash)));
         if written.is_err() {
             // A full disk must not keep half a file; one that is not there is as good.
             let _ = fs::remove_file(&unfinished);
@@ -191,7 +194,7 @@ impl Folder {
     }
 
     fn path(&self, hash: &ContentHash) -> PathBuf {
-        self.0.join(hash.0.iter().map(|byte| format!("{byte:02x}")).collect::<String>())
+        self.0.join(hash.to_string())
     }
 }
 
