@@ -20,11 +20,14 @@ const INTERVAL: Duration = Duration::from_millis(100);
 /// How often [`Units::early`] is asked at most: it may pass over all that there is.
 const EARLY_INTERVAL: Duration = Duration::from_secs(2);
 
+/// How finely the bar is drawn.
+const BAR_STEPS: u64 = 10_000;
+
 /// What the bar counts besides jobs.
 #[derive(Clone)]
 pub(crate) struct Units {
-    /// Jobs of the whole run, where known beforehand.
-    pub jobs: u64,
+    /// How much of the run is done, 0 to 1.
+    pub share: Arc<dyn Fn(&Progress) -> f64 + Send + Sync>,
     /// Units of work of the whole run (samples, iterations).
     pub total: f64,
     /// What they are called.
@@ -91,6 +94,7 @@ async fn tell_lines(progress: &mut watch::Receiver<Progress>, units: Units) {
                 "event": "progress",
                 "jobs_done": now.jobs_done,
                 "jobs_known": now.jobs_known,
+                "share": (early.units.share)(&now),
                 "replanned": now.replanned,
                 "nodes": now.nodes,
                 "tasks": now.active_tasks.iter().map(|name| &**name).collect::<Vec<&str>>(),
@@ -108,7 +112,7 @@ async fn tell_lines(progress: &mut watch::Receiver<Progress>, units: Units) {
 }
 
 async fn tell_bar(progress: &mut watch::Receiver<Progress>, units: Units) {
-    let bar = ProgressBar::new(units.jobs);
+    let bar = ProgressBar::new(BAR_STEPS);
     let style = BarStyle::with_template("{prefix:>8} {wide_bar} {percent:>3}%  {msg}")
         .expect("the template is valid");
     bar.set_style(style);
@@ -118,7 +122,7 @@ async fn tell_bar(progress: &mut watch::Receiver<Progress>, units: Units) {
         let words = early.known().await.map(|early| early.words.clone());
         {
             let now = progress.borrow_and_update();
-            bar.set_position(now.jobs_done.min(units.jobs));
+            bar.set_position(whole((units.share)(&now) * BAR_STEPS as f64));
             bar.set_prefix(now.active_tasks.last().map_or("start", |task| &**task).to_owned());
             let said = message(&now, &units, began.elapsed());
             bar.set_message([Some(said), words].into_iter().flatten().collect::<Vec<_>>().join("  "));
@@ -153,10 +157,10 @@ fn message(now: &Progress, units: &Units, elapsed: Duration) -> String {
     if now.coordinator == CoordinatorLink::Reconnecting {
         return "coordinator lost, trying again; nodes go on working".to_owned();
     }
-    if now.jobs_done == 0 || units.jobs == 0 {
+    let share = (units.share)(now);
+    if share <= 0.0 {
         return String::new();
     }
-    let share = count(now.jobs_done) / count(units.jobs);
     let rate = units.total * share / elapsed.as_secs_f64();
     let left = elapsed.mul_f64((1.0 - share).max(0.0) / share);
     format!("{} {}/s  ETA {}  nodes {}", HumanCount(whole(rate)), units.name, clock(left), now.nodes)
@@ -181,11 +185,6 @@ fn clock(duration: Duration) -> String {
     }
 }
 
-#[expect(clippy::cast_precision_loss, reason = "a count for people")]
-fn count(number: u64) -> f64 {
-    number as f64
-}
-
 #[expect(
     clippy::cast_possible_truncation,
     clippy::cast_sign_loss,
@@ -202,7 +201,8 @@ mod tests {
     #[test]
     fn the_bar_tells_rate_and_remaining_time() {
         let now = Progress { jobs_done: 25, jobs_known: 100, nodes: 3, ..Progress::default() };
-        let units = Units { jobs: 100, total: 1_000_000.0, name: "samples", early: None };
+        let share = Arc::new(|now: &Progress| now.jobs_done as f64 / 100.0);
+        let units = Units { share, total: 1_000_000.0, name: "samples", early: None };
         assert_eq!(message(&now, &units, Duration::from_secs(10)), "25,000 samples/s  ETA 30s  nodes 3");
         let stuck = Progress { waiting: Some(WaitReason::NoNode), ..now };
         assert!(message(&stuck, &units, Duration::from_secs(10)).contains("no node"));

@@ -6,8 +6,12 @@
 
 use std::{
     collections::{BTreeSet, VecDeque},
+    iter,
     ops::Range,
-    sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError},
+    sync::{
+        Arc, Mutex, MutexGuard, OnceLock, PoisonError,
+        atomic::{AtomicU64, Ordering},
+    },
 };
 
 use client_sdk::{
@@ -30,10 +34,13 @@ pub const NULL_TASK: &str = "null";
 /// Most iterations of one run.
 pub const MAX_ITERATIONS: u64 = 10_000_000;
 
-/// Most bytes of results of jobs in flight, apart from the one that always is.
-const FLIGHT_BYTES: u64 = 2 << 30;
+/// Most bytes of results of jobs in flight, apart from the one that always is. They wait in the nodes' spools: what the
+/// application holds of them is bounded by its `Window`.
+const FLIGHT_BYTES: u64 = 8 << 30;
+/// The same until the first results say how long an iteration takes.
+const FIRST_FLIGHT_BYTES: u64 = 2 << 30;
 /// Most jobs in flight.
-const FLIGHT_JOBS: usize = 256;
+const FLIGHT_JOBS: u64 = 256;
 /// Counts (pairs times sequences times iterations) of a job, where the run is long enough: two seconds of an H200.
 const JOB_COUNTS: u64 = 2_000_000_000_000;
 /// Jobs that a run has at least, where it has as many iterations.
@@ -44,6 +51,13 @@ const JOB_ITERATIONS: u64 = 256;
 const JOB_COMMANDS: u64 = 3_500;
 /// Most bytes of a job's matrices.
 const JOB_MATRIX_BYTES: u64 = 256 << 20;
+/// Bytes of sums that a device makes in a second at most, where a job may be that long: some five devices together fill
+/// what an application takes (about 500 MB/s).
+const SUMS_BYTES_PER_S: f64 = 80e6;
+/// A job has at most this share of the iterations left, and a run's last ones this share of its first ones' length:
+/// devices that end at different times wait for a short job.
+const LEFT_SHARE: u64 = 8;
+const SHORT_SHARE: u64 = 4;
 
 /// What jobs bring back.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -101,20 +115,13 @@ pub enum MiError {
 #[derive(Clone, Debug)]
 pub struct MiHandle {
     shared: Arc<Shared>,
-    jobs: u64,
 }
 
 impl MiHandle {
-    /// Jobs of the run.
+    /// Iterations in the sums so far, those of an earlier run included. Never waits.
     #[must_use]
-    pub fn jobs(&self) -> u64 {
-        self.jobs
-    }
-
-    /// Iterations in the sums so far, those of an earlier run included.
-    #[must_use]
-    pub fn iterations_done(&self) -> usize {
-        self.shared.sums().iterations()
+    pub fn iterations_done(&self) -> u64 {
+        self.shared.iterations_done.load(Ordering::Relaxed)
     }
 
     /// Nodes that results came from.
@@ -165,8 +172,9 @@ pub fn mi_graph(alignment: Arc<Alignment>, options: MiOptions) -> Result<(TaskGr
     if let Some((held, _)) = sums.maxima().last_key_value().filter(|(held, _)| **held >= iterations) {
         return Err(MiError::Earlier { held: *held, iterations });
     }
-    let ranges = missing(&sums, iterations, job_iterations(&shape, mode, iterations));
-    let jobs = ranges.len() as u64 + 1;
+    let lengths = Lengths::new(&shape, mode, iterations);
+    let remaining = Remaining::new(&sums, iterations);
+    let earlier = sums.iterations() as u64;
     let shared = Arc::new(Shared {
         alignment,
         shape,
@@ -174,44 +182,103 @@ pub fn mi_graph(alignment: Arc<Alignment>, options: MiOptions) -> Result<(TaskGr
         observed: OnceLock::new(),
         observed_contents: OnceLock::new(),
         sums: Mutex::new(sums),
+        iterations_done: AtomicU64::new(earlier),
         nodes: Mutex::new(BTreeSet::new()),
     });
     let needs = Requirements { simulated, ..Requirements::ANY };
     let observed = ObservedTask { needs, shared: Arc::clone(&shared) };
-    let null = NullTask { needs, ranges, seed, mode, shared: Arc::clone(&shared) };
+    let null = NullTask { needs, remaining, lengths, earlier, seed, mode, shared: Arc::clone(&shared) };
     let graph =
         TaskGraph::new().task(OBSERVED_TASK, observed).task(NULL_TASK, null).after(NULL_TASK, OBSERVED_TASK);
-    Ok((graph, MiHandle { shared, jobs }))
+    Ok((graph, MiHandle { shared }))
 }
 
-/// Iterations of one job: long enough for a fast device, short enough that many devices share the run.
-fn job_iterations(shape: &Shape, mode: Mode, iterations: u64) -> u64 {
-    let pairs = shape.pairs() as u64;
-    let long = JOB_COUNTS / (pairs * u64::from(shape.rows())).max(1);
-    let commands = JOB_COMMANDS / (4 + 3 * shape.chunks().len() as u64);
-    let held = match mode {
-        Mode::Reduce => JOB_ITERATIONS,
-        Mode::Matrix => JOB_MATRIX_BYTES / (pairs * 4),
-    };
-    long.min(iterations.div_ceil(LEAST_JOBS)).min(JOB_ITERATIONS).min(commands).min(held).max(1)
+/// How many iterations a job gets, and how many jobs are in flight.
+#[derive(Clone, Copy, Debug)]
+struct Lengths {
+    mode: Mode,
+    pairs: u64,
+    /// While nothing is known of the devices: long enough for a fast one, short enough that many share the run.
+    first: u64,
+    most: u64,
 }
 
-/// The iterations of `0..iterations` that are not in the sums, in ranges of at most `most`, and of a quarter of it in the
-/// last eighth: devices that end at different times wait for a short job.
-fn missing(sums: &Accumulators, iterations: u64, most: u64) -> VecDeque<Range<u64>> {
-    let mut ranges = VecDeque::new();
-    let mut start = 0;
-    let last_eighth = iterations - iterations / 8;
-    for held in sums.maxima().keys().copied().chain([iterations]) {
-        while start < held {
-            let most = if start < last_eighth { most } else { most.div_ceil(4) };
-            let end = held.min(start + most);
-            ranges.push_back(start..end);
-            start = end;
-        }
-        start = held + 1;
+impl Lengths {
+    fn new(shape: &Shape, mode: Mode, iterations: u64) -> Self {
+        let pairs = shape.pairs() as u64;
+        let long = JOB_COUNTS / (pairs * u64::from(shape.rows())).max(1);
+        let commands = JOB_COMMANDS / (4 + 3 * shape.chunks().len() as u64);
+        let held = match mode {
+            Mode::Reduce => JOB_ITERATIONS,
+            Mode::Matrix => JOB_MATRIX_BYTES / (pairs * 4),
+        };
+        let most = JOB_ITERATIONS.min(commands).min(held).max(1);
+        let first = long.min(iterations.div_ceil(LEAST_JOBS)).clamp(1, most);
+        Self { mode, pairs, first, most }
     }
-    ranges
+
+    /// Iterations of the next job, `left` being without one. `iteration_s` is what one took so far: where sums are large
+    /// and devices fast, jobs are so long that the application keeps up with their results.
+    #[expect(
+        clippy::cast_precision_loss,
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        reason = "a length that is bounded right after; `as` saturates"
+    )]
+    fn next(&self, left: u64, iteration_s: Option<f64>) -> u64 {
+        let by_result = match (self.mode, iteration_s) {
+            (Mode::Reduce, Some(iteration_s)) => {
+                (self.result_bytes(1) as f64 / (SUMS_BYTES_PER_S * iteration_s)) as u64
+            }
+            _ => 0,
+        };
+        let full = self.first.max(by_result).min(self.most);
+        full.min(left.div_ceil(LEFT_SHARE)).max(full.div_ceil(SHORT_SHARE))
+    }
+
+    fn result_bytes(&self, iterations: u64) -> u64 {
+        match self.mode {
+            Mode::Reduce => self.pairs * 20,
+            Mode::Matrix => self.pairs * 4 * iterations,
+        }
+    }
+
+    /// How many jobs of so many iterations may be in flight.
+    fn in_flight(&self, iterations: u64, measured: bool) -> u64 {
+        let bytes = if measured { FLIGHT_BYTES } else { FIRST_FLIGHT_BYTES };
+        (bytes / self.result_bytes(iterations).max(1)).clamp(2, FLIGHT_JOBS)
+    }
+}
+
+/// The iterations that no job has yet, in order.
+#[derive(Debug)]
+struct Remaining {
+    ranges: VecDeque<Range<u64>>,
+}
+
+impl Remaining {
+    /// Those of `0..iterations` that are not in the sums.
+    fn new(sums: &Accumulators, iterations: u64) -> Self {
+        let held = sums.maxima().keys().copied();
+        let starts = iter::once(0).chain(held.clone().map(|held| held + 1));
+        let ranges = starts.zip(held.chain([iterations])).map(|(start, end)| start..end);
+        Self { ranges: ranges.filter(|range| !range.is_empty()).collect() }
+    }
+
+    fn left(&self) -> u64 {
+        self.ranges.iter().map(|range| range.end - range.start).sum()
+    }
+
+    /// At most so many iterations, one after the other.
+    fn take(&mut self, most: u64) -> Option<Range<u64>> {
+        let range = self.ranges.front_mut()?;
+        let taken = range.start..range.end.min(range.start + most);
+        range.start = taken.end;
+        if range.is_empty() {
+            self.ranges.pop_front();
+        }
+        Some(taken)
+    }
 }
 
 /// What the jobs, the tasks and the handle share.
@@ -225,6 +292,8 @@ struct Shared {
     /// A lock, not an owner with messages: jobs are retrieved on the run's own threads and must know that their sums
     /// were taken before they say so; the handle reads between two of them. Held for one merge or one copy.
     sums: Mutex<Accumulators>,
+    /// Of the sums, for who must not wait for them.
+    iterations_done: AtomicU64,
     /// As `sums`; held for one insertion.
     nodes: Mutex<BTreeSet<NodeId>>,
 }
@@ -307,33 +376,45 @@ impl Job for ObservedJob {
 #[derive(Debug)]
 struct NullTask {
     needs: Requirements,
-    ranges: VecDeque<Range<u64>>,
+    remaining: Remaining,
+    lengths: Lengths,
+    /// Iterations in the sums before the run.
+    earlier: u64,
     seed: Seed,
     mode: Mode,
     shared: Arc<Shared>,
 }
 
 impl NullTask {
-    fn next_jobs(&mut self, in_flight: u64) -> Vec<Box<dyn Job>> {
-        let pairs = self.shared.shape.pairs() as u64;
-        let job_bytes = match self.mode {
-            Mode::Reduce => pairs * 20,
-            Mode::Matrix => self.ranges.front().map_or(0, |range| (range.end - range.start) * pairs * 4),
-        };
-        let room =
-            usize::try_from(FLIGHT_BYTES / job_bytes.max(1)).unwrap_or(FLIGHT_JOBS).clamp(2, FLIGHT_JOBS);
-        let room = room.saturating_sub(usize::try_from(in_flight).unwrap_or(usize::MAX));
-        let ranges = self.ranges.drain(..room.min(self.ranges.len()));
-        let (seed, mode, shared) = (self.seed, self.mode, &self.shared);
-        ranges
-            .map(|range| {
-                let pass = match mode {
-                    Mode::Reduce => Pass::Reduce(range),
-                    Mode::Matrix => Pass::Matrix(range),
-                };
-                Box::new(NullJob { job: MiJob { seed, pass }, shared: Arc::clone(shared) }) as Box<dyn Job>
-            })
-            .collect()
+    fn next_jobs(&mut self, progress: &TaskProgress) -> Vec<Box<dyn Job>> {
+        let iteration_s = self.iteration_s(progress);
+        let mut in_flight = progress.jobs_known - progress.jobs_done;
+        let mut jobs: Vec<Box<dyn Job>> = Vec::new();
+        let mut left = self.remaining.left();
+        while left > 0 {
+            let length = self.lengths.next(left, iteration_s);
+            if in_flight >= self.lengths.in_flight(length, iteration_s.is_some()) {
+                break;
+            }
+            let Some(range) = self.remaining.take(length) else { break };
+            left -= range.end - range.start;
+            in_flight += 1;
+            let pass = match self.mode {
+                Mode::Reduce => Pass::Reduce(range),
+                Mode::Matrix => Pass::Matrix(range),
+            };
+            let job = MiJob { seed: self.seed, pass };
+            jobs.push(Box::new(NullJob { job, shared: Arc::clone(&self.shared) }));
+        }
+        jobs
+    }
+
+    /// Measured device time of one iteration, over all devices.
+    #[expect(clippy::cast_precision_loss, reason = "a mean")]
+    fn iteration_s(&self, progress: &TaskProgress) -> Option<f64> {
+        let done = self.shared.iterations_done.load(Ordering::Relaxed) - self.earlier;
+        let mean_s = progress.device_time.as_secs_f64() / done as f64;
+        (done > 0 && mean_s > 0.0).then_some(mean_s)
     }
 }
 
@@ -359,11 +440,11 @@ impl Task for NullTask {
     }
 
     fn jobs(&mut self) -> Vec<Box<dyn Job>> {
-        self.next_jobs(0)
+        self.next_jobs(&TaskProgress::default())
     }
 
     fn more_jobs(&mut self, progress: &TaskProgress) -> Vec<Box<dyn Job>> {
-        self.next_jobs(progress.jobs_known - progress.jobs_done)
+        self.next_jobs(progress)
     }
 }
 
@@ -387,7 +468,10 @@ impl Job for NullJob {
             .sums(&self.shared.shape, observed, &result.sections)
             .map_err(RetrieveError::application)?;
         self.shared.note(result.node);
-        self.shared.sums().merge(sums).map_err(RetrieveError::application)
+        let iterations = sums.iterations() as u64;
+        self.shared.sums().merge(sums).map_err(RetrieveError::application)?;
+        self.shared.iterations_done.fetch_add(iterations, Ordering::Relaxed);
+        Ok(())
     }
 }
 
@@ -413,26 +497,43 @@ mod tests {
         let null = NullModel::new(&reference, Seed(1), ShuffleKind::Feistel);
         let mut sums = null.run(0..3).unwrap();
         sums.merge(null.run(7..8).unwrap()).unwrap();
-        assert_eq!(missing(&sums, 12, 3), [3..6, 6..7, 8..11, 11..12]);
-        assert_eq!(
-            missing(&sums, 8, 100),
-            [3..7, 7..7].into_iter().filter(|r| !r.is_empty()).collect::<Vec<_>>()
-        );
+        let ranges = |iterations| Remaining::new(&sums, iterations).ranges;
+        assert_eq!(ranges(12), [3..7, 8..12]);
+        assert_eq!(ranges(8), [3..7]);
+        let mut remaining = Remaining::new(&sums, 12);
+        assert_eq!(remaining.left(), 8);
+        let taken: Vec<_> = iter::from_fn(|| remaining.take(3)).collect();
+        assert_eq!(taken, [3..6, 6..7, 8..11, 11..12]);
         let error = mi_graph(Arc::clone(&alignment), options(7, Some(sums.clone()))).unwrap_err();
         assert_eq!(error, MiError::Earlier { held: 7, iterations: 7 });
         let error = mi_graph(Arc::clone(&alignment), options(7, Some(Accumulators::new(9)))).unwrap_err();
         assert_eq!(error, MiError::OtherSums);
         let (_, handle) = mi_graph(alignment, options(12, Some(sums))).unwrap();
-        assert_eq!((handle.iterations_done(), handle.jobs()), (4, 9));
+        assert_eq!(handle.iterations_done(), 4);
     }
 
     #[test]
-    fn jobs_fit_the_run_and_the_program() {
+    fn first_jobs_fit_the_run_and_the_program() {
         let alignment = parse(b"ACA\nACC\nGTA\nGTC\n").unwrap().alignment;
         let shape = Shape::new(&alignment).unwrap();
         for (iterations, expected) in [(0, 1), (1, 1), (64, 1), (1_000, 16), (1 << 20, 256)] {
-            assert_eq!(job_iterations(&shape, Mode::Reduce, iterations), expected, "{iterations}");
+            assert_eq!(Lengths::new(&shape, Mode::Reduce, iterations).first, expected, "{iterations}");
         }
         assert!(mi_graph(Arc::new(alignment), options(MAX_ITERATIONS + 1, None)).is_err());
+    }
+
+    #[test]
+    fn jobs_are_as_long_as_their_results_are_large_and_short_at_the_end() {
+        // The thesis' second set on an H200: 252 MB of sums, 44 ms an iteration.
+        let lengths = Lengths { mode: Mode::Reduce, pairs: 12_628_338, first: 3, most: 256 };
+        assert_eq!(lengths.next(10_000, None), 3);
+        assert_eq!(lengths.next(10_000, Some(0.044)), 71);
+        assert_eq!(lengths.next(240, Some(0.044)), 30);
+        assert_eq!(lengths.next(1, Some(0.044)), 18);
+        assert_eq!(lengths.next(10_000, Some(1e-6)), 256);
+        assert_eq!(lengths.next(10_000, Some(130.0)), 3, "slow devices: results are no burden");
+        let matrices = Lengths { mode: Mode::Matrix, ..lengths };
+        assert_eq!(matrices.next(10_000, Some(0.044)), 3, "twice the iterations are twice the bytes");
+        assert_eq!((lengths.in_flight(71, false), lengths.in_flight(71, true)), (8, 34));
     }
 }

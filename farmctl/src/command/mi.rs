@@ -9,7 +9,7 @@ use std::{
 };
 
 use anyhow::{Context as _, anyhow};
-use client_sdk::{FarmError, FarmOptions, RunSummary, SimulatedDevices};
+use client_sdk::{FarmError, FarmOptions, Progress, RunSummary, SimulatedDevices};
 use mi_kernel::{
     Accumulators, Alignment, Filters, GapMode, NullModel, Reference, Seed, ShuffleKind, histogram,
     job::{MiHandle, MiOptions, Mode, mi_graph},
@@ -66,7 +66,8 @@ pub(crate) async fn run(arguments: &MiArgs, target: &Target<'_>) -> Result<(), F
         earlier: input.earlier.clone(),
         simulated: SimulatedDevices::Refused,
     };
-    let before = input.earlier.as_ref().map_or(0, Accumulators::iterations);
+    let before = input.earlier.as_ref().map_or(0, Accumulators::iterations) as u64;
+    let asked = arguments.iterations.saturating_sub(before);
     let (graph, handle) =
         mi_graph(Arc::clone(&input.alignment), options).with_context(|| shown(&arguments.alignment))?;
     let (reach, own_farm) = tokio::select! {
@@ -75,8 +76,8 @@ pub(crate) async fn run(arguments: &MiArgs, target: &Target<'_>) -> Result<(), F
     };
     #[expect(clippy::cast_precision_loss, reason = "a rate for people")]
     let units = Units {
-        jobs: handle.jobs(),
-        total: arguments.iterations.saturating_sub(before as u64) as f64,
+        share: done_of(handle.clone(), before, asked),
+        total: asked as f64,
         name: "iterations",
         early: Some(early_z(handle.clone())),
     };
@@ -94,6 +95,12 @@ pub(crate) async fn run(arguments: &MiArgs, target: &Target<'_>) -> Result<(), F
         }
     }
     ended
+}
+
+/// The share of the iterations asked for that are in the sums; scoring the alignment itself does not count.
+#[expect(clippy::cast_precision_loss, reason = "a share for people")]
+fn done_of(handle: MiHandle, before: u64, asked: u64) -> Arc<dyn Fn(&Progress) -> f64 + Send + Sync> {
+    Arc::new(move |_| (handle.iterations_done() - before) as f64 / asked.max(1) as f64)
 }
 
 /// The pair that leads while the run goes on.
@@ -186,13 +193,14 @@ async fn finish(
     input: &Input,
     handle: &MiHandle,
     arguments: &MiArgs,
-    before: usize,
+    before: u64,
 ) -> Result<(), Failure> {
     let (summary, failure) = match result {
         Ok(summary) => (summary, None),
         Err(error) => (RunSummary::default(), Some(Failure::of_run(error))),
     };
-    let done = handle.iterations_done();
+    let sums = handle.sums();
+    let done = sums.iterations() as u64;
     let Some(observed) = handle.observed().filter(|_| failure.is_none() || done > before) else {
         tell!("farmctl: no iteration was added: nothing was written");
         return Err(failure.unwrap_or_else(|| anyhow!("the run gave no scores").into()));
@@ -201,7 +209,7 @@ async fn finish(
         alignment: Arc::clone(&input.alignment),
         seed: Seed(arguments.seed),
         observed,
-        sums: handle.sums(),
+        sums,
         folder: arguments.folder.clone(),
         top: arguments.top.unwrap_or_else(|| input.alignment.l() * 5),
     };
@@ -264,7 +272,7 @@ fn column_numbers(input: &Input) -> Option<Vec<usize>> {
     (l != input.read[1]).then(|| (0..l).map(|column| input.alignment.number(column)).collect())
 }
 
-fn tell(summary: &RunSummary, arguments: &MiArgs, added: usize, best: &str) -> Result<(), Failure> {
+fn tell(summary: &RunSummary, arguments: &MiArgs, added: u64, best: &str) -> Result<(), Failure> {
     let prepare: Duration = summary.tasks.iter().map(|task| task.prepare_time).sum();
     let seconds = summary.wall_time.saturating_sub(prepare).as_secs_f64();
     if arguments.progress == ProgressStyle::Ndjson {

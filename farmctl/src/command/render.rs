@@ -1,6 +1,6 @@
 //! `farmctl render`: a scene folder in, images out, through a farm.
 
-use std::{path::Path, time::Duration};
+use std::{path::Path, sync::Arc, time::Duration};
 
 use anyhow::{Context as _, anyhow};
 use bdpt_kernel::{
@@ -49,9 +49,10 @@ pub(crate) async fn run(arguments: &RenderArgs, target: &Target<'_>) -> Result<(
         () = stops.recv() => return Err(anyhow!("interrupted before rendering: no image was written").into()),
     };
     let plan = render.plan();
+    let jobs = plan.tile_jobs() + u64::from(plan.light_jobs());
     #[expect(clippy::cast_precision_loss, reason = "a rate for people")]
     let units = Units {
-        jobs: plan.tile_jobs() + u64::from(plan.light_jobs()),
+        share: Arc::new(move |now| now.jobs_done as f64 / jobs as f64),
         total: plan.total_samples() as f64,
         name: "samples",
         early: None,
