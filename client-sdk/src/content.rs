@@ -11,7 +11,7 @@ use std::{
 
 use bytes::Bytes;
 use farm_core::{id::ContentHash, program::Content};
-use proto::codec::content_hash;
+use proto::link::{ContentBytes, ContentSource};
 
 /// The bytes of every live run's contents, shared between the runs that add to it and the data server that reads.
 ///
@@ -21,19 +21,18 @@ use proto::codec::content_hash;
 #[derive(Clone, Debug, Default)]
 pub(crate) struct ContentStore {
     contents: Arc<RwLock<HashMap<ContentHash, Stored>>>,
-    /// Bytes that nodes fetched.
     served_bytes: Arc<AtomicU64>,
 }
 
 #[derive(Debug)]
 struct Stored {
-    bytes: Bytes,
+    bytes: ContentBytes,
     runs: usize,
 }
 
 impl ContentStore {
     /// The bytes of a content that some live run owns.
-    pub(crate) fn get(&self, hash: &ContentHash) -> Option<Bytes> {
+    pub(crate) fn get(&self, hash: &ContentHash) -> Option<ContentBytes> {
         self.contents
             .read()
             .unwrap_or_else(PoisonError::into_inner)
@@ -41,21 +40,20 @@ impl ContentStore {
             .map(|stored| stored.bytes.clone())
     }
 
-    /// The same, for a node that fetches it.
-    pub(crate) fn serve(&self, hash: &ContentHash) -> Option<Bytes> {
-        let bytes = self.get(hash)?;
-        self.served_bytes.fetch_add(bytes.len() as u64, Ordering::Relaxed);
-        Some(bytes)
+    /// What nodes fetch from here.
+    pub(crate) fn source(&self) -> ContentSource {
+        let store = self.clone();
+        ContentSource::new(move |hash| store.get(&hash)).counted_in(Arc::clone(&self.served_bytes))
     }
 
-    /// Bytes of contents that nodes fetched so far, those of fetches that broke off too.
+    /// Bytes that nodes fetched so far, those of fetches that broke off too.
     pub(crate) fn served_bytes(&self) -> u64 {
         self.served_bytes.load(Ordering::Relaxed)
     }
 
-    fn retain(&self, hash: ContentHash, bytes: Bytes) {
+    fn retain(&self, bytes: ContentBytes) {
         let mut contents = self.contents.write().unwrap_or_else(PoisonError::into_inner);
-        contents.entry(hash).or_insert(Stored { bytes, runs: 0 }).runs += 1;
+        contents.entry(bytes.content().hash).or_insert(Stored { bytes, runs: 0 }).runs += 1;
     }
 
     fn release(&self, hash: &ContentHash) {
@@ -86,12 +84,12 @@ impl TaskData {
     /// A task allocation: read-only for kernels, fetched once by each node that runs a job naming it. Its size must be
     /// a positive multiple of 4, as for every buffer; `validate` says so when a program names it.
     pub fn allocation(&mut self, bytes: impl Into<Bytes>) -> Content {
-        self.add(bytes.into())
+        self.add(ContentBytes::new(bytes))
     }
 
     /// A module: WGSL text.
     pub fn module(&mut self, wgsl: impl Into<Bytes>) -> Content {
-        self.add(wgsl.into())
+        self.add(ContentBytes::new(wgsl))
     }
 
     /// What was added here.
@@ -99,10 +97,10 @@ impl TaskData {
         self.added.iter().copied()
     }
 
-    fn add(&mut self, bytes: Bytes) -> Content {
-        let content = Content { hash: content_hash(&bytes), size_bytes: bytes.len() as u64 };
+    fn add(&mut self, bytes: ContentBytes) -> Content {
+        let content = bytes.content();
         if self.added.insert(content) {
-            self.store.retain(content.hash, bytes);
+            self.store.retain(bytes);
         }
         content
     }
@@ -132,7 +130,7 @@ mod tests {
         drop(first);
         assert_eq!(store.get(&a.hash).as_deref(), Some(&[1_u8; 8][..]));
         drop(second);
-        assert_eq!(store.get(&a.hash), None);
+        assert!(store.get(&a.hash).is_none());
         assert!(store.contents.read().unwrap().is_empty(), "nothing may stay behind");
     }
 }

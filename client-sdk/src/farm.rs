@@ -8,10 +8,7 @@ use std::{
     thread,
 };
 
-use proto::{
-    control::{SessionError, connect_app},
-    link::ContentSource,
-};
+use proto::control::{SessionError, connect_app};
 use tokio::{
     sync::{oneshot, watch},
     task::JoinHandle,
@@ -85,14 +82,13 @@ impl Farm {
         let (closing, closing_receiver) = oneshot::channel();
         let (registered, registration) = oneshot::channel();
         let store = ContentStore::default();
-        let contents = store.clone();
         let driver_task = tokio::spawn(drive(DriverSetup {
             options: options.clone(),
             handle: driver.clone(),
             inputs,
             session,
             registered,
-            contents: ContentSource::new(move |hash| contents.serve(&hash)),
+            contents: store.source(),
             progress: progress.clone(),
             stop: stop_receiver,
             closing: closing_receiver,

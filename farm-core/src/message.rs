@@ -14,7 +14,7 @@ use crate::{
 };
 
 /// The protocol this build speaks. A peer of another version is refused at hello.
-pub const PROTOCOL_VERSION: u32 = 3;
+pub const PROTOCOL_VERSION: u32 = 4;
 
 /// Estimated work of a job: nanoseconds on a device of speed 1.0. Zero means unknown.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]

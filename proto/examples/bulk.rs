@@ -10,10 +10,7 @@ use farm_core::{
     message::{AppToNode, NodeToApp},
     program::Content,
 };
-use proto::{
-    codec::content_hash,
-    link::{ContentSource, DataServer, Link, connect},
-};
+use proto::link::{Arrived, ContentBytes, ContentSource, DataServer, Link, connect};
 use quinn::{ClientConfig, Endpoint, ServerConfig, crypto::rustls::QuicClientConfig};
 use rustls::pki_types::PrivateKeyDer;
 use tokio::{
@@ -78,7 +75,8 @@ struct ContentCopy {
 impl ContentCopy {
     async fn prepare(bytes: &Bytes) -> Outcome<Self> {
         let server = DataServer::bind(loopback(), None)?;
-        let kept = bytes.clone();
+        let kept = ContentBytes::new(bytes.clone());
+        let content = kept.content();
         let source = ContentSource::new(move |_| Some(kept.clone()));
         let addresses = [server.local_addr().to_string()];
         let accepted = async {
@@ -86,12 +84,11 @@ impl ContentCopy {
             Ok::<_, Box<dyn Error + Send + Sync>>(incoming.establish(|_| ContentSource::empty()).await?)
         };
         let (app, node) = tokio::join!(connect(&addresses, server.certificate_der(), None, source), accepted);
-        let content = Content { hash: content_hash(bytes), size_bytes: bytes.len() as u64 };
         Ok(Self { content, _app: app?, node: node?.0, _server: server })
     }
 
     async fn copy(&self, bytes: &Bytes) -> Outcome<()> {
-        let came = self.node.sender.fetch(self.content).await?;
+        let came = self.node.sender.fetch(self.content, &mut Arrived::default()).await?;
         same(&came, bytes)
     }
 }

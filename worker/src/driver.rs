@@ -4,12 +4,10 @@
 use std::{
     collections::HashMap,
     io,
-    pin::Pin,
     sync::Arc,
     time::{Duration, Instant, SystemTime},
 };
 
-use bytes::Bytes;
 use farm_core::{
     id::{DeviceIndex, JobAttempt, LinkId, NodeId},
     message::{AppToNode, CoordinatorToNode, JobFailure, LatencyClass, NodeToApp, NodeToCoordinator},
@@ -33,7 +31,7 @@ use crate::{
     contents::{Contents, Fetched},
     device::{Device, DeviceEvent, DeviceNews},
     executor::{Executor, Order},
-    link::{self, Outbox},
+    link::{self, Outbox, Source},
     payload::Payloads,
     session::{self, NodeLink},
 };
@@ -441,19 +439,13 @@ impl Driver {
             self.found.push(Event::ContentReady(content.hash));
             return;
         }
-        let fetch: Pin<Box<dyn Future<Output = Result<Bytes, String>> + Send>> = match from {
+        let from = match from {
             Provider::Application(link) => {
-                let sender = self.links.get(&link).map(|outbox| outbox.sender().clone());
-                Box::pin(async move {
-                    let sender = sender.ok_or("its application's link is over")?;
-                    sender.fetch(content).await.map_err(|error| error.to_string())
-                })
+                Source::Application(self.links.get(&link).map(|outbox| outbox.sender().clone()))
             }
-            Provider::Node(contact) => {
-                Box::pin(link::fetch_from_peer(contact, self.options.identity.clone(), content))
-            }
+            Provider::Node(contact) => Source::Node(contact, self.options.identity.clone()),
         };
-        self.contents.fetch(content, fetch, self.inputs.clone());
+        self.contents.fetch(content, from, self.inputs.clone());
     }
 
     fn execute(&mut self, job: JobAttempt, index: DeviceIndex, class: LatencyClass) {

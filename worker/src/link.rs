@@ -13,7 +13,9 @@ use farm_core::{
     program::Content,
 };
 use proto::{
-    link::{ContentSource, DataServer, Frame, Link, LinkReceiver, LinkSender, TrySendError},
+    link::{
+        Arrived, ContentBytes, ContentSource, DataServer, Frame, Link, LinkReceiver, LinkSender, TrySendError,
+    },
     trust::{Identity, Principal, Role},
 };
 use tokio::sync::mpsc;
@@ -47,18 +49,36 @@ fn fetchable(contents: ContentSource, peer: Option<&Principal>) -> ContentSource
     }
 }
 
-/// Fetches a content from another node, on a link of its own: its handshake is little beside a large content.
-pub(crate) async fn fetch_from_peer(
-    contact: Contact,
-    identity: Option<Identity>,
-    content: Content,
-) -> Result<Bytes, String> {
-    let Contact { addresses, certificate_der } = contact;
-    let link: Link<AppToNode, NodeToApp> =
-        proto::link::connect(&addresses, &certificate_der, identity.as_ref(), ContentSource::empty())
-            .await
-            .map_err(|error| error.to_string())?;
-    link.sender.fetch(content).await.map_err(|error| error.to_string())
+/// Where a content is fetched from.
+#[derive(Debug)]
+pub(crate) enum Source {
+    /// An application, on its link; there is none if that is over.
+    Application(Option<LinkSender<NodeToApp>>),
+    /// Another node, on a link of its own: its handshake is little beside a large content.
+    Node(Contact, Option<Identity>),
+}
+
+impl Source {
+    /// Fetches what is missing of a content.
+    ///
+    /// # Errors
+    /// It could not be had, for people; `arrived` holds what is right of it.
+    pub(crate) async fn fetch(self, content: Content, arrived: &mut Arrived) -> Result<ContentBytes, String> {
+        let fetched = match self {
+            Self::Application(sender) => {
+                sender.ok_or("its application's link is over")?.fetch(content, arrived).await
+            }
+            Self::Node(Contact { addresses, certificate_der }, identity) => {
+                let nothing = ContentSource::empty();
+                let link: Link<AppToNode, NodeToApp> =
+                    proto::link::connect(&addresses, &certificate_der, identity.as_ref(), nothing)
+                        .await
+                        .map_err(|error| error.to_string())?;
+                link.sender.fetch(content, arrived).await
+            }
+        };
+        fetched.map_err(|error| error.to_string())
+    }
 }
 
 async fn read(

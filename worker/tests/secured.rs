@@ -13,7 +13,7 @@ use farm_core::{
 };
 use proto::{
     control::{self, Invitation},
-    link::{self, ContentSource, Link},
+    link::{self, Arrived, ContentSource, Link},
     trust::{Authority, Capability, IDENTITY_LIFETIME, Identity, Role},
 };
 use tempfile::TempDir;
@@ -131,8 +131,13 @@ async fn a_node_lets_in_whom_the_coordinator_vouches_for() {
     // Without an identity of the farm there is no link at all: the handshake, or the first word on it, fails.
     for who in [None, Some(&stranger)] {
         if let Some(mut link) = dial(&farm, &worker, who).await {
-            let fetched =
-                link.sender.fetch(Content { hash: proto::codec::content_hash(b"x"), size_bytes: 1 }).await;
+            let fetched = link
+                .sender
+                .fetch(
+                    Content { hash: proto::codec::content_hash(b"x"), size_bytes: 1 },
+                    &mut Arrived::default(),
+                )
+                .await;
             assert!(matches!(fetched, Err(link::FetchError::Link(_))), "{who:?}: {fetched:?}");
             let mut frames = Vec::new();
             assert!(link.receiver.recv_many(&mut frames, 1).await.is_err(), "{who:?}");

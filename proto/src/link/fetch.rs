@@ -1,22 +1,26 @@
-//! Content fetches over a link: one bidirectional stream each. The request is the digest and the size; the answer is
-//! one byte (found or not), the size, and the bytes.
+//! Content fetches over a link: one bidirectional stream each. The request is the digest, the size, and from which piece on;
+//! the answer is one byte (found or not), the size, the outline (see [`super::outline`]) and the pieces. Each is checked as it
+//! comes; what was checked outlives the fetch, and the next one, of whichever peer, goes on from there.
 
 use std::{sync::Arc, time::Duration};
 
-use bytes::{BufMut, Bytes, BytesMut};
+use bytes::{Buf as _, BufMut as _, BytesMut};
 use farm_core::{id::ContentHash, program::Content};
 use quinn::{ReadExactError, RecvStream, SendStream, WriteError};
 use thiserror::Error;
 
-use super::{ContentSource, LinkError, MAX_CONTENT_BYTES, shared::Shared, wire::protocol};
+use super::{
+    ContentSource, LinkError, MAX_CONTENT_BYTES,
+    outline::{ContentBytes, Outline, PIECE_BYTES},
+    shared::Shared,
+    wire::protocol,
+};
 
 /// A fetch in which no byte comes for this long is given up.
 pub const STALL_TIMEOUT: Duration = Duration::from_secs(30);
-/// A content is sent in pieces of this size, in bytes.
-const PIECE_BYTES: usize = 1 << 20;
 /// The receiving buffer starts at most this large and doubles as bytes really come, in bytes.
 const FIRST_BYTES: usize = 4 << 20;
-const REQUEST_BYTES: usize = 32 + 8;
+const REQUEST_BYTES: usize = 32 + 8 + 4;
 const ANSWER_BYTES: usize = 1 + 8;
 const NOT_FOUND: u8 = 0;
 const FOUND: u8 = 1;
@@ -51,8 +55,27 @@ pub enum FetchError {
     Link(#[from] LinkError),
 }
 
+/// What of a content has come and was checked.
+#[derive(Debug, Default)]
+pub struct Arrived {
+    /// Whole pieces from the start.
+    bytes: BytesMut,
+}
+
+impl Arrived {
+    /// How many bytes are here.
+    #[must_use]
+    pub fn size_bytes(&self) -> u64 {
+        self.bytes.len() as u64
+    }
+}
+
 /// The asking side.
-pub(super) async fn fetch(shared: Arc<Shared>, content: Content) -> Result<Bytes, FetchError> {
+pub(super) async fn fetch(
+    shared: Arc<Shared>,
+    content: Content,
+    arrived: &mut Arrived,
+) -> Result<ContentBytes, FetchError> {
     let hash = content.hash;
     let size = match usize::try_from(content.size_bytes) {
         Ok(size) if content.size_bytes <= MAX_CONTENT_BYTES => size,
@@ -61,19 +84,22 @@ pub(super) async fn fetch(shared: Arc<Shared>, content: Content) -> Result<Bytes
     let lost = |_| FetchError::Link(shared.error());
     // Waits while FETCH_STREAMS are on the way.
     let (mut request, mut answer) = shared.connection.open_bi().await.map_err(LinkError::from)?;
+    let first = u32::try_from(arrived.bytes.len() / PIECE_BYTES).expect("the cap is some thousand pieces");
     let mut buffer = BytesMut::with_capacity(REQUEST_BYTES);
     buffer.put_slice(&hash.0);
     buffer.put_u64_le(content.size_bytes);
+    buffer.put_u32_le(first);
     request.write_chunk(buffer.freeze()).await.map_err(lost)?;
     // The stream is new and was written to: it cannot be closed.
     let _ = request.finish();
 
-    let mut head = [0; ANSWER_BYTES];
-    within_stall(hash, answer.read_exact(&mut head)).await?.map_err(|_: ReadExactError| {
+    let cut = |_: ReadExactError| {
         FetchError::Link(
             shared.over().unwrap_or_else(|| protocol("a fetch's answer ends in its head".to_owned())),
         )
-    })?;
+    };
+    let mut head = [0; ANSWER_BYTES];
+    within_stall(hash, answer.read_exact(&mut head)).await?.map_err(cut)?;
     let [found, announced @ ..] = head;
     if found != FOUND {
         return Err(FetchError::NotFound(hash));
@@ -83,33 +109,75 @@ pub(super) async fn fetch(shared: Arc<Shared>, content: Content) -> Result<Bytes
         let reason = format!("the peer has {announced} B under this name, not {} B", content.size_bytes);
         return Err(FetchError::Corrupt { hash, reason });
     }
-    read_content(&shared, &mut answer, hash, size).await
+    let mut told = vec![0; Outline::values(size) * blake3::OUT_LEN];
+    within_stall(hash, answer.read_exact(&mut told)).await?.map_err(cut)?;
+    let outline = Outline::parse(&told, hash, size)
+        .ok_or_else(|| FetchError::Corrupt { hash, reason: "the outline is of another digest".to_owned() })?;
+    read_pieces(&shared, &mut answer, (hash, size), &outline, &mut arrived.bytes).await?;
+    let bytes = std::mem::take(arrived).bytes.freeze();
+    Ok(ContentBytes::checked(hash, bytes, outline))
 }
 
-async fn read_content(
+/// Reads to the end of the answer. What is in `bytes` afterwards was checked, whatever the outcome.
+async fn read_pieces(
     shared: &Shared,
     answer: &mut RecvStream,
+    (hash, size): (ContentHash, usize),
+    outline: &Outline,
+    bytes: &mut BytesMut,
+) -> Result<(), FetchError> {
+    bytes.reserve((size - bytes.len()).min(FIRST_BYTES));
+    let mut checked = bytes.len();
+    let outcome = loop {
+        let read = match within_stall(hash, answer.read_chunk(PIECE_BYTES, true)).await {
+            Ok(read) => read.map_err(|_| FetchError::Link(shared.error())),
+            Err(stalled) => Err(stalled),
+        };
+        match read {
+            Ok(Some(chunk)) if bytes.len() + chunk.bytes.len() > size => {
+                break Err(FetchError::Corrupt { hash, reason: format!("more than {size} B came") });
+            }
+            Ok(Some(chunk)) => bytes.extend_from_slice(&chunk.bytes),
+            Ok(None) => break Ok(()),
+            Err(error) => break Err(error),
+        }
+        if let Err(piece) = check(outline, hash, size, bytes, &mut checked) {
+            let reason = format!("the bytes from {} on have another digest", piece * PIECE_BYTES);
+            break Err(FetchError::Corrupt { hash, reason });
+        }
+    };
+    let came = bytes.len();
+    bytes.truncate(checked);
+    outcome?;
+    if came < size {
+        return Err(FetchError::Corrupt { hash, reason: format!("{came} B came of {size} B") });
+    }
+    // Without any byte there was nothing to check.
+    let empty_is_right = size > 0 || outline.proves(hash, 0, &[]);
+    empty_is_right
+        .then_some(())
+        .ok_or_else(|| FetchError::Corrupt { hash, reason: "no bytes have another digest".to_owned() })
+}
+
+/// Checks the pieces that are complete and were not checked yet; the number of the first that is wrong otherwise.
+fn check(
+    outline: &Outline,
     hash: ContentHash,
     size: usize,
-) -> Result<Bytes, FetchError> {
-    let mut bytes = BytesMut::with_capacity(size.min(FIRST_BYTES));
-    let mut hasher = blake3::Hasher::new();
+    bytes: &[u8],
+    checked: &mut usize,
+) -> Result<(), usize> {
     loop {
-        let read = within_stall(hash, answer.read_chunk(PIECE_BYTES, true)).await?;
-        let Some(chunk) = read.map_err(|_| FetchError::Link(shared.error()))? else { break };
-        if bytes.len() + chunk.bytes.len() > size {
-            return Err(FetchError::Corrupt { hash, reason: format!("more than {size} B came") });
+        let end = size.min(*checked + PIECE_BYTES);
+        if *checked == end || bytes.len() < end {
+            return Ok(());
         }
-        hasher.update(&chunk.bytes);
-        bytes.extend_from_slice(&chunk.bytes);
+        let index = *checked / PIECE_BYTES;
+        if !outline.proves(hash, index, &bytes[*checked..end]) {
+            return Err(index);
+        }
+        *checked = end;
     }
-    if bytes.len() < size {
-        return Err(FetchError::Corrupt { hash, reason: format!("{} B came of {size} B", bytes.len()) });
-    }
-    if *hasher.finalize().as_bytes() != hash.0 {
-        return Err(FetchError::Corrupt { hash, reason: "the bytes have another digest".to_owned() });
-    }
-    Ok(bytes.freeze())
 }
 
 async fn within_stall<T>(hash: ContentHash, step: impl Future<Output = T>) -> Result<T, FetchError> {
@@ -136,19 +204,28 @@ async fn answer_fetch(
 ) -> Result<(), String> {
     let mut asked = [0; REQUEST_BYTES];
     request.read_exact(&mut asked).await.map_err(|error| error.to_string())?;
+    let mut asked = &asked[..];
     let mut hash = [0; 32];
-    hash.copy_from_slice(&asked[..32]);
-    let (found, _room) = source.get(ContentHash(hash)).await.unzip();
-    let mut head = BytesMut::with_capacity(ANSWER_BYTES);
-    head.put_u8(if found.is_some() { FOUND } else { NOT_FOUND });
-    head.put_u64_le(found.as_ref().map_or(0, |bytes| bytes.len() as u64));
+    asked.copy_to_slice(&mut hash);
+    let _size_bytes = asked.get_u64_le();
+    let first = asked.get_u32_le() as usize;
     let write = |error: WriteError| error.to_string();
+    let Some((found, _room)) = source.get(ContentHash(hash)).await else {
+        answer.write_all(&[NOT_FOUND; ANSWER_BYTES]).await.map_err(write)?;
+        return answer.finish().map_err(|error| error.to_string());
+    };
+    let mut head = BytesMut::new();
+    head.put_u8(FOUND);
+    head.put_u64_le(found.len() as u64);
+    head.put_slice(found.outline().as_bytes());
     answer.write_chunk(head.freeze()).await.map_err(write)?;
-    let mut rest = found.unwrap_or_default();
+    let mut rest = found.bytes().slice(found.len().min(first.saturating_mul(PIECE_BYTES))..);
     while !rest.is_empty() {
         // Slices of the source's own memory: nothing is copied, and flow control holds the rest back.
         let piece = rest.split_to(rest.len().min(PIECE_BYTES));
+        let piece_bytes = piece.len() as u64;
         answer.write_chunk(piece).await.map_err(write)?;
+        source.count(piece_bytes);
     }
     answer.finish().map_err(|error| error.to_string())
 }

@@ -13,12 +13,19 @@
 
 mod connect;
 mod fetch;
+mod outline;
 mod receive;
 mod send;
 mod shared;
 mod wire;
 
-use std::{fmt, sync::Arc};
+use std::{
+    fmt,
+    sync::{
+        Arc,
+        atomic::{AtomicU64, Ordering},
+    },
+};
 
 use bytes::Bytes;
 use farm_core::id::ContentHash;
@@ -28,7 +35,8 @@ use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 
 pub use self::{
     connect::{BindError, CONNECT_TIMEOUT, ConnectError, DataServer, Incoming, MAX_LINKS, connect},
-    fetch::{FetchError, STALL_TIMEOUT},
+    fetch::{Arrived, FetchError, STALL_TIMEOUT},
+    outline::{ContentBytes, PIECE_BYTES},
     receive::LinkReceiver,
     send::{LinkSender, TrySendError},
     wire::{decode_frames, encode_frame},
@@ -77,23 +85,27 @@ pub struct Link<S, R> {
 pub struct ContentSource {
     at_hand: Lookup,
     stored: Option<(Lookup, Arc<Semaphore>)>,
+    served_bytes: Arc<AtomicU64>,
 }
 
 /// Contents that were read from storage for others, and are not sent yet; each is in memory whole.
 const STORED_AT_ONCE: usize = 4;
 
-type Lookup = Arc<dyn Fn(ContentHash) -> Option<Bytes> + Send + Sync>;
+type Lookup = Arc<dyn Fn(ContentHash) -> Option<ContentBytes> + Send + Sync>;
 
 impl ContentSource {
     /// A source that asks `lookup`. Called on a network task: it looks up, it does not compute or block.
-    pub fn new(lookup: impl Fn(ContentHash) -> Option<Bytes> + Send + Sync + 'static) -> Self {
-        Self { at_hand: Arc::new(lookup), stored: None }
+    pub fn new(lookup: impl Fn(ContentHash) -> Option<ContentBytes> + Send + Sync + 'static) -> Self {
+        Self { at_hand: Arc::new(lookup), stored: None, served_bytes: Arc::default() }
     }
 
     /// Where that has nothing, `lookup` is asked, which may block: it is called on a thread for that. Four answers of it are in
     /// memory at once; further ones wait until one is sent.
     #[must_use]
-    pub fn or_stored(self, lookup: impl Fn(ContentHash) -> Option<Bytes> + Send + Sync + 'static) -> Self {
+    pub fn or_stored(
+        self,
+        lookup: impl Fn(ContentHash) -> Option<ContentBytes> + Send + Sync + 'static,
+    ) -> Self {
         Self { stored: Some((Arc::new(lookup), Arc::new(Semaphore::new(STORED_AT_ONCE)))), ..self }
     }
 
@@ -103,8 +115,18 @@ impl ContentSource {
         Self::new(|_| None)
     }
 
+    /// Adds the bytes of contents that are sent to this count, those of fetches that break off too.
+    #[must_use]
+    pub fn counted_in(self, served_bytes: Arc<AtomicU64>) -> Self {
+        Self { served_bytes, ..self }
+    }
+
+    fn count(&self, bytes: u64) {
+        self.served_bytes.fetch_add(bytes, Ordering::Relaxed);
+    }
+
     /// The bytes, and what to keep until they are sent.
-    async fn get(&self, hash: ContentHash) -> Option<(Bytes, Option<OwnedSemaphorePermit>)> {
+    async fn get(&self, hash: ContentHash) -> Option<(ContentBytes, Option<OwnedSemaphorePermit>)> {
         if let Some(bytes) = (self.at_hand)(hash) {
             return Some((bytes, None));
         }

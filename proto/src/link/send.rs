@@ -9,8 +9,8 @@ use thiserror::Error;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc, oneshot};
 
 use super::{
-    BULK_STREAMS, FetchError, Header, LinkError, MAX_PAYLOAD_BYTES, QUEUED_FRAMES, SMALL_PAYLOAD_BYTES,
-    fetch,
+    Arrived, BULK_STREAMS, ContentBytes, FetchError, Header, LinkError, MAX_PAYLOAD_BYTES, QUEUED_FRAMES,
+    SMALL_PAYLOAD_BYTES, fetch,
     shared::{Guard, Shared},
     wire,
 };
@@ -118,12 +118,13 @@ impl<S: Header> LinkSender<S> {
 }
 
 impl<S> LinkSender<S> {
-    /// Fetches a content from the other side's [`super::ContentSource`]; the bytes are checked against size and digest.
+    /// Fetches a content from the other side's [`super::ContentSource`], or what is missing of it; the bytes are checked against
+    /// size and digest, piece by piece. After an error `arrived` holds what is right; it must not be of another content.
     ///
     /// # Errors
     /// Not found, wrong bytes, stalled, or the link is over.
-    pub async fn fetch(&self, content: Content) -> Result<Bytes, FetchError> {
-        fetch::fetch(self.guard.shared(), content).await
+    pub async fn fetch(&self, content: Content, arrived: &mut Arrived) -> Result<ContentBytes, FetchError> {
+        fetch::fetch(self.guard.shared(), content, arrived).await
     }
 
     /// The peer's address.

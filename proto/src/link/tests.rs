@@ -1,6 +1,12 @@
 //! Links over loopback: honest ones, and peers that break the protocol on purpose.
 
-use std::{net::SocketAddr, sync::Arc};
+use std::{
+    net::SocketAddr,
+    sync::{
+        Arc,
+        atomic::{AtomicU64, Ordering},
+    },
+};
 
 use bytes::{BufMut, Bytes, BytesMut};
 use farm_core::{
@@ -14,8 +20,8 @@ use farm_core::{
 use quinn::{Connection, SendStream};
 
 use super::{
-    ConnectError, ContentSource, DataServer, FetchError, Frame, Link, LinkError, MAX_CONTENT_BYTES,
-    MAX_PAYLOAD_BYTES, SMALL_PAYLOAD_BYTES, TrySendError, connect,
+    Arrived, ConnectError, ContentBytes, ContentSource, DataServer, FetchError, Frame, Link, LinkError,
+    MAX_CONTENT_BYTES, MAX_PAYLOAD_BYTES, PIECE_BYTES, SMALL_PAYLOAD_BYTES, TrySendError, connect,
     connect::dial,
     wire::{BULK_STREAM, ORDERED_STREAM},
 };
@@ -268,32 +274,41 @@ async fn contents_are_fetched_and_checked() {
     let small = Bytes::from_static(b"module text");
     let empty = Bytes::new();
     let liar = content(b"what was promised");
-    let kept =
-        [large.clone(), small.clone(), empty.clone()].map(|bytes| (codec::content_hash(&bytes), bytes));
+    let kept = [large.clone(), small.clone(), empty.clone()].map(ContentBytes::new);
     let source = ContentSource::new(move |hash| {
         // Same size as promised, other bytes.
-        let corrupt = (liar.hash, Bytes::from_static(b"What was promised"));
-        kept.iter().chain([&corrupt]).find(|(known, _)| *known == hash).map(|(_, bytes)| bytes.clone())
+        let corrupt = ContentBytes::new("What was promised");
+        if hash == liar.hash {
+            Some(corrupt)
+        } else {
+            kept.iter().find(|kept| kept.content().hash == hash).cloned()
+        }
     });
     let (_app, node, _server) = linked(source).await;
     let fetches = [large, small.clone(), empty].map(|bytes| {
         let sender = node.sender.clone();
-        tokio::spawn(
-            async move { assert!(sender.fetch(content(&bytes)).await.unwrap() == bytes, "other bytes") },
-        )
+        tokio::spawn(async move {
+            assert!(
+                sender.fetch(content(&bytes), &mut Arrived::default()).await.unwrap().into_bytes() == bytes,
+                "other bytes"
+            )
+        })
     });
     for fetch in fetches {
         fetch.await.unwrap();
     }
     let missing = content(b"nobody has this");
-    assert_eq!(node.sender.fetch(missing).await, Err(FetchError::NotFound(missing.hash)));
-    let corrupt = node.sender.fetch(liar).await;
+    assert_eq!(
+        node.sender.fetch(missing, &mut Arrived::default()).await,
+        Err(FetchError::NotFound(missing.hash))
+    );
+    let corrupt = node.sender.fetch(liar, &mut Arrived::default()).await;
     assert!(matches!(corrupt, Err(FetchError::Corrupt { hash, .. }) if hash == liar.hash), "got {corrupt:?}");
     let wrong_size = Content { size_bytes: 12, ..content(&small) };
-    let corrupt = node.sender.fetch(wrong_size).await;
+    let corrupt = node.sender.fetch(wrong_size, &mut Arrived::default()).await;
     assert!(matches!(corrupt, Err(FetchError::Corrupt { .. })), "got {corrupt:?}");
     let huge = Content { hash: ContentHash([0; 32]), size_bytes: MAX_CONTENT_BYTES + 1 };
-    let refused = node.sender.fetch(huge).await;
+    let refused = node.sender.fetch(huge, &mut Arrived::default()).await;
     assert!(matches!(refused, Err(FetchError::TooLarge { .. })), "got {refused:?}");
 }
 
@@ -422,12 +437,74 @@ async fn a_fetch_answer_that_is_too_long_or_short_is_refused() {
             answer.finish().unwrap();
         };
         let asking = Arc::new(Content { hash: ContentHash([1; 32]), size_bytes: 10 });
-        let (outcome, ()) = tokio::join!(node.sender.fetch(*asking), answering);
+        let mut arrived = Arrived::default();
+        let (outcome, ()) = tokio::join!(node.sender.fetch(*asking, &mut arrived), answering);
         assert!(
             matches!(outcome, Err(FetchError::Corrupt { .. })),
             "{sent} of {announced} B: got {outcome:?}"
         );
     }
+}
+
+#[tokio::test]
+async fn a_fetch_that_breaks_off_goes_on_at_another_peer() {
+    let whole = ContentBytes::new(pattern(5 * PIECE_BYTES + 9));
+    let content = whole.content();
+    let mut arrived = Arrived::default();
+
+    // Two pieces and a half, then a cut.
+    let (peer, node, _server) = raw_peer().await;
+    let cut = async {
+        let (mut answer, _request) = peer.accept_bi().await.unwrap();
+        answer.write_all(&fetch_head(&whole)).await.unwrap();
+        answer.write_all(&whole[..2 * PIECE_BYTES + PIECE_BYTES / 2]).await.unwrap();
+        // Until it has come, or the cut would overtake it.
+        answer.finish().unwrap();
+        answer.stopped().await.unwrap();
+        peer.close(quinn::VarInt::from_u32(0), b"gone");
+    };
+    let (outcome, ()) = tokio::join!(node.sender.fetch(content, &mut arrived), cut);
+    outcome.unwrap_err();
+    assert_eq!(arrived.size_bytes(), 2 * PIECE_BYTES as u64, "whole pieces stay");
+
+    // The third, and a fourth that is not right.
+    let (peer, node, _server) = raw_peer().await;
+    let lie = async {
+        let (mut answer, mut request) = peer.accept_bi().await.unwrap();
+        let asked = request.read_to_end(100).await.unwrap();
+        assert_eq!(asked[40..], 2_u32.to_le_bytes(), "from the third piece on");
+        answer.write_all(&fetch_head(&whole)).await.unwrap();
+        answer.write_all(&whole[2 * PIECE_BYTES..3 * PIECE_BYTES]).await.unwrap();
+        // The asking side stops listening in the midst of it.
+        let _ = answer.write_all(&vec![7; 2 * PIECE_BYTES + 9]).await;
+    };
+    let (outcome, ()) = tokio::join!(node.sender.fetch(content, &mut arrived), lie);
+    assert!(
+        matches!(&outcome, Err(FetchError::Corrupt { reason, .. }) if reason.contains("from 3145728 on")),
+        "got {outcome:?}"
+    );
+    assert_eq!(arrived.size_bytes(), 3 * PIECE_BYTES as u64, "a wrong piece is not kept");
+
+    // The rest, from who has it.
+    let served = Arc::new(AtomicU64::new(0));
+    let kept = whole.clone();
+    let source = ContentSource::new(move |_| Some(kept.clone())).counted_in(Arc::clone(&served));
+    let (_app, node, _server) = linked(source).await;
+    let came = node.sender.fetch(content, &mut arrived).await.unwrap();
+    assert!(came.bytes() == whole.bytes(), "other bytes");
+    assert_eq!(
+        served.load(Ordering::Relaxed),
+        2 * PIECE_BYTES as u64 + 9,
+        "what was there did not come again"
+    );
+}
+
+/// What an honest peer sends before the pieces.
+fn fetch_head(content: &ContentBytes) -> Vec<u8> {
+    let mut head = vec![1];
+    head.extend((content.len() as u64).to_le_bytes());
+    head.extend(content.outline().as_bytes());
+    head
 }
 
 #[tokio::test]
@@ -437,7 +514,8 @@ async fn a_fetch_ends_with_its_link() {
         let _streams = peer.accept_bi().await.unwrap();
         peer.close(quinn::VarInt::from_u32(0), b"gone");
     };
-    let asking = node.sender.fetch(Content { hash: ContentHash([7; 32]), size_bytes: 10 });
+    let mut arrived = Arrived::default();
+    let asking = node.sender.fetch(Content { hash: ContentHash([7; 32]), size_bytes: 10 }, &mut arrived);
     let (outcome, ()) = tokio::join!(asking, silent);
     assert_eq!(outcome, Err(FetchError::Link(LinkError::ClosedByPeer { reason: "gone".to_owned() })));
 }

@@ -12,8 +12,8 @@ use std::{
     time::{Duration, SystemTime},
 };
 
-use bytes::Bytes;
 use farm_core::{id::ContentHash, program::Content};
+use proto::link::ContentBytes;
 
 /// Most files; the oldest go first beyond it.
 const MAX_FILES: usize = 65_536;
@@ -151,16 +151,16 @@ impl Folder {
     ///
     /// # Errors
     /// It is not there, or spoilt.
-    pub(super) fn read(&self, hash: &ContentHash) -> io::Result<Bytes> {
+    pub(super) fn read(&self, hash: &ContentHash) -> io::Result<ContentBytes> {
         let path = self.path(hash);
-        let bytes = fs::read(&path)?;
-        if *blake3::hash(&bytes).as_bytes() != hash.0 {
+        let bytes = ContentBytes::new(fs::read(&path)?);
+        if bytes.content().hash != *hash {
             self.remove(hash);
             return Err(io::Error::new(io::ErrorKind::InvalidData, "the file is spoilt and was removed"));
         }
         // The order of use is for the next process, too; a disk that is read-only by now loses it.
         let _ = fs::File::open(&path).and_then(|file| file.set_modified(SystemTime::now()));
-        Ok(Bytes::from(bytes))
+        Ok(bytes)
     }
 
     /// Writes a content under its name, whole or not at all.
@@ -240,7 +240,7 @@ mod tests {
         for hash in [first.hash, second.hash] {
             fs::File::open(cache.folder().path(&hash)).unwrap().set_modified(earlier).unwrap();
         }
-        assert_eq!(cache.folder().read(&first.hash).unwrap(), "first");
+        assert_eq!(&cache.folder().read(&first.hash).unwrap()[..], b"first");
 
         let mut cache = DiskCache::open(folder.path(), 10).unwrap();
         assert_eq!(cache.figures(), (2, 10));

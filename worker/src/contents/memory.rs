@@ -6,8 +6,8 @@ use std::{
     sync::{Arc, PoisonError, RwLock},
 };
 
-use bytes::Bytes;
-use farm_core::id::ContentHash;
+use farm_core::{id::ContentHash, program::Content};
+use proto::link::ContentBytes;
 
 /// The bytes of the contents in memory, for whoever answers fetches.
 ///
@@ -15,17 +15,17 @@ use farm_core::id::ContentHash;
 /// machine's turn. It is held for a map operation only, bytes are reference-counted.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Shelf {
-    bytes: Arc<RwLock<HashMap<ContentHash, Bytes>>>,
+    bytes: Arc<RwLock<HashMap<ContentHash, ContentBytes>>>,
 }
 
 impl Shelf {
     /// The bytes of a content that is in memory.
-    pub(crate) fn get(&self, hash: &ContentHash) -> Option<Bytes> {
+    pub(crate) fn get(&self, hash: &ContentHash) -> Option<ContentBytes> {
         self.bytes.read().unwrap_or_else(PoisonError::into_inner).get(hash).cloned()
     }
 
-    fn put(&self, hash: ContentHash, bytes: Bytes) {
-        self.bytes.write().unwrap_or_else(PoisonError::into_inner).insert(hash, bytes);
+    fn put(&self, bytes: ContentBytes) {
+        self.bytes.write().unwrap_or_else(PoisonError::into_inner).insert(bytes.content().hash, bytes);
     }
 
     fn take(&self, hash: &ContentHash) {
@@ -130,14 +130,13 @@ impl MemoryCache {
     /// Takes a content in, pinned; evicts idle ones for it, which `evicted` is told of.
     pub(super) fn insert(
         &mut self,
-        hash: ContentHash,
-        bytes: Bytes,
+        bytes: ContentBytes,
         mut evicted: impl FnMut(ContentHash),
     ) -> Result<(), CacheFull> {
+        let Content { hash, size_bytes } = bytes.content();
         if self.pin(hash) {
             return Ok(());
         }
-        let size_bytes = bytes.len() as u64;
         while self.bytes + size_bytes > self.cap_bytes {
             let Some((_, oldest)) = self.idle.pop_first() else {
                 return Err(CacheFull { pinned_bytes: self.bytes, cap_bytes: self.cap_bytes });
@@ -146,7 +145,7 @@ impl MemoryCache {
             evicted(oldest);
         }
         self.bytes += size_bytes;
-        self.shelf.put(hash, bytes);
+        self.shelf.put(bytes);
         self.entries.insert(hash, Entry { size_bytes, last_use: 0, pinned: true });
         Ok(())
     }
@@ -156,8 +155,9 @@ impl MemoryCache {
 mod tests {
     use super::*;
 
-    fn content(tag: u8, size_bytes: usize) -> (ContentHash, Bytes) {
-        (ContentHash([tag; 32]), Bytes::from(vec![tag; size_bytes]))
+    fn content(tag: u8, size_bytes: usize) -> (ContentHash, ContentBytes) {
+        let bytes = ContentBytes::new(vec![tag; size_bytes]);
+        (bytes.content().hash, bytes)
     }
 
     #[test]
@@ -165,13 +165,13 @@ mod tests {
         let mut cache = MemoryCache::new(100);
         let [(a, a_bytes), (b, b_bytes), (c, c_bytes)] = [content(1, 40), content(2, 40), content(3, 40)];
         let mut evicted = Vec::new();
-        cache.insert(a, a_bytes, |hash| evicted.push(hash)).unwrap();
-        cache.insert(b, b_bytes, |hash| evicted.push(hash)).unwrap();
+        cache.insert(a_bytes, |hash| evicted.push(hash)).unwrap();
+        cache.insert(b_bytes, |hash| evicted.push(hash)).unwrap();
         cache.release(a);
         cache.release(b);
         assert!(cache.pin(a), "a is here");
         cache.release(a);
-        cache.insert(c, c_bytes, |hash| evicted.push(hash)).unwrap();
+        cache.insert(c_bytes, |hash| evicted.push(hash)).unwrap();
         assert_eq!(evicted, [b], "whoever announces contents is told");
         assert!(cache.shelf().get(&b).is_none(), "b was used before a");
         assert!(cache.shelf().get(&a).is_some() && cache.shelf().get(&c).is_some(), "only one had to go");
@@ -180,16 +180,13 @@ mod tests {
     #[test]
     fn pinned_contents_stay_and_the_cap_holds() {
         let mut cache = MemoryCache::new(100);
-        let [(a, a_bytes), (b, b_bytes)] = [content(1, 60), content(2, 60)];
-        cache.insert(a, a_bytes.clone(), drop).unwrap();
-        cache.insert(a, a_bytes, drop).unwrap();
+        let [(a, a_bytes), (_, b_bytes)] = [content(1, 60), content(2, 60)];
+        cache.insert(a_bytes.clone(), drop).unwrap();
+        cache.insert(a_bytes, drop).unwrap();
         assert_eq!(cache.bytes, 60, "the same content is held once");
-        assert_eq!(
-            cache.insert(b, b_bytes.clone(), drop),
-            Err(CacheFull { pinned_bytes: 60, cap_bytes: 100 })
-        );
+        assert_eq!(cache.insert(b_bytes.clone(), drop), Err(CacheFull { pinned_bytes: 60, cap_bytes: 100 }));
         cache.release(a);
-        cache.insert(b, b_bytes, drop).unwrap();
+        cache.insert(b_bytes, drop).unwrap();
         assert!(cache.shelf().get(&a).is_none(), "the cap holds");
     }
 }

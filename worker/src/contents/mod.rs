@@ -12,7 +12,7 @@ use std::{
 
 use bytes::Bytes;
 use farm_core::{id::ContentHash, message::CacheFigures, program::Content, worker::Event};
-use proto::link::ContentSource;
+use proto::link::{Arrived, ContentBytes, ContentSource};
 use tokio::sync::mpsc;
 
 pub(crate) use self::memory::Shelf;
@@ -20,10 +20,12 @@ use self::{
     disk::{DiskCache, Folder},
     memory::MemoryCache,
 };
-use crate::driver::Input;
+use crate::{driver::Input, link::Source};
 
 /// Most bytes on their way to disk: memory beyond the cache's cap. What comes faster than the disk writes is not kept there.
 const MAX_WRITING_BYTES: u64 = 4 << 30;
+/// Most bytes that broken off fetches leave in memory; those of a further one come again from the start.
+const MAX_ARRIVED_BYTES: u64 = 4 << 30;
 
 /// What is kept, and what is on its way.
 #[derive(Debug)]
@@ -32,6 +34,8 @@ pub(crate) struct Contents {
     disk: Option<DiskCache>,
     /// Fetches on the way, and whether the machine still waits for them.
     fetching: HashMap<ContentHash, bool>,
+    /// What fetches that broke off left of contents that jobs still need: the next one goes on from there.
+    arrived: HashMap<ContentHash, Arrived>,
     /// Bytes on their way to disk.
     writing_bytes: u64,
     figures: CacheFigures,
@@ -43,7 +47,9 @@ pub(crate) struct Contents {
 #[derive(Debug)]
 pub(crate) struct Fetched {
     /// The bytes, checked; or why there are none, for people.
-    result: Result<Bytes, String>,
+    result: Result<ContentBytes, String>,
+    /// What is right of it, if there is an error.
+    arrived: Arrived,
     /// From the disk, not from elsewhere.
     from_disk: bool,
     /// The disk did not have what it should.
@@ -61,6 +67,7 @@ impl Contents {
             memory: MemoryCache::new(memory_cap_bytes),
             disk,
             fetching: HashMap::new(),
+            arrived: HashMap::new(),
             writing_bytes: 0,
             figures: CacheFigures::default(),
             told: CacheFigures::default(),
@@ -94,18 +101,14 @@ impl Contents {
         here
     }
 
-    /// Brings a content here, from the disk if it is there, else by `fetch`; the outcome comes as an [`Input::Fetched`].
+    /// Brings a content here, from the disk if it is there, else from a peer; the outcome comes as an [`Input::Fetched`].
     /// One that is on its way already is not fetched twice.
-    pub(crate) fn fetch(
-        &mut self,
-        content: Content,
-        fetch: impl Future<Output = Result<Bytes, String>> + Send + 'static,
-        inputs: mpsc::Sender<Input>,
-    ) {
+    pub(crate) fn fetch(&mut self, content: Content, from: Source, inputs: mpsc::Sender<Input>) {
         if self.fetching.insert(content.hash, true).is_some() {
             return;
         }
         let disk = self.disk.as_ref().filter(|disk| disk.has(&content.hash)).map(DiskCache::folder);
+        let mut arrived = self.arrived.remove(&content.hash).unwrap_or_default();
         tokio::spawn(async move {
             let stored = match &disk {
                 Some(folder) => read(folder.clone(), content).await,
@@ -114,9 +117,9 @@ impl Contents {
             let (from_disk, disk_failed) = (stored.is_some(), disk.is_some() && stored.is_none());
             let result = match stored {
                 Some(bytes) => Ok(bytes),
-                None => fetch.await,
+                None => from.fetch(content, &mut arrived).await,
             };
-            let fetched = Fetched { result, from_disk, disk_failed };
+            let fetched = Fetched { result, arrived, from_disk, disk_failed };
             // Without a driver the worker has ended.
             let _ = inputs.send(Input::Fetched { content, fetched }).await;
         });
@@ -146,10 +149,15 @@ impl Contents {
                     self.figures.fetches += 1;
                     self.figures.fetched_bytes += content.size_bytes;
                 }
-                self.keep(content, &bytes, fetched.from_disk, inputs);
-                self.take_in(hash, bytes, &mut events)
+                self.keep(content, bytes.bytes(), fetched.from_disk, inputs);
+                self.take_in(bytes, &mut events)
             }
-            Err(reason) => Some(reason),
+            Err(reason) => {
+                if wanted && fetched.arrived.size_bytes() + self.arrived_bytes() <= MAX_ARRIVED_BYTES {
+                    self.arrived.insert(hash, fetched.arrived);
+                }
+                Some(reason)
+            }
         };
         match (wanted, failure) {
             (true, None) => events.push(Event::ContentReady(hash)),
@@ -162,6 +170,7 @@ impl Contents {
     /// No job needs a content any more.
     pub(crate) fn release(&mut self, hash: ContentHash) {
         self.memory.release(hash);
+        self.arrived.remove(&hash);
         if let Some(wanted) = self.fetching.get_mut(&hash) {
             *wanted = false;
         }
@@ -212,11 +221,15 @@ impl Contents {
         (std::mem::replace(&mut self.told, now) != now).then_some(now)
     }
 
+    fn arrived_bytes(&self) -> u64 {
+        self.arrived.values().map(Arrived::size_bytes).sum()
+    }
+
     /// Puts bytes into memory, pinned; the reason, for people, if there is no room.
-    fn take_in(&mut self, hash: ContentHash, bytes: Bytes, events: &mut Vec<Event>) -> Option<String> {
+    fn take_in(&mut self, bytes: ContentBytes, events: &mut Vec<Event>) -> Option<String> {
         let Self { memory, disk, figures, .. } = self;
         let mut gone = Vec::new();
-        let taken = memory.insert(hash, bytes, |hash| gone.push(hash));
+        let taken = memory.insert(bytes, |hash| gone.push(hash));
         figures.memory_evictions += gone.len() as u64;
         gone.retain(|hash| disk.as_ref().is_none_or(|disk| !disk.has(hash)));
         events.extend(evicted(gone));
@@ -252,7 +265,7 @@ fn evicted(gone: Vec<ContentHash>) -> Vec<Event> {
 }
 
 /// Reads a content from disk; `None` if it is not what it should be.
-async fn read(folder: Folder, content: Content) -> Option<Bytes> {
+async fn read(folder: Folder, content: Content) -> Option<ContentBytes> {
     let read = tokio::task::spawn_blocking(move || folder.read(&content.hash)).await.ok()?;
     match read {
         Ok(bytes) if bytes.len() as u64 == content.size_bytes => Some(bytes),

@@ -16,6 +16,7 @@ use farm_core::{
     message::JobFailure,
 };
 use gpu_exec::DeviceSpec;
+use proto::link::ContentBytes;
 use tokio::{sync::mpsc, time::timeout};
 
 use super::{
@@ -223,7 +224,7 @@ impl Supervisor {
                 }
             }
             FromExecutor::Wants(hash) => {
-                let bytes = self.contents.get(&hash);
+                let bytes = self.contents.get(&hash).map(ContentBytes::into_bytes);
                 let size_bytes = bytes.as_ref().map(|bytes| bytes.len() as u64);
                 process.send(&ToExecutor::Content { hash, size_bytes }, bytes);
             }

@@ -51,7 +51,7 @@ impl InProcess {
             Ok(program) => {
                 let contents = named_contents(&program)
                     .into_iter()
-                    .filter_map(|hash| Some((hash, self.contents.get(&hash)?)))
+                    .filter_map(|hash| Some((hash, self.contents.get(&hash)?.into_bytes())))
                     .collect();
                 let program = Arc::new(program);
                 self.executor.submit(gpu_exec::Order { job, class, program, contents, limit })
