@@ -32,8 +32,9 @@ use crate::{
     device::{Device, DeviceEvent, DeviceNews},
     executor::{Executor, Order},
     link::{self, Outbox, Source},
-    payload::Payloads,
+    programs::Programs,
     session::{self, NodeLink},
+    spool::Spool,
 };
 
 /// Inputs that wait for the owner task, at most; further senders wait.
@@ -64,6 +65,10 @@ pub(crate) enum Input {
     Fetched { content: Content, fetched: Fetched },
     /// A content has been written to disk, or not.
     Stored { content: Content, result: io::Result<()> },
+    /// The disk took results, or did not.
+    SpoolChanged,
+    /// A result cannot be read back from disk.
+    ResultLost { job: JobAttempt },
     /// The process was asked to end in order.
     Drain,
 }
@@ -74,6 +79,7 @@ pub(crate) struct Setup {
     pub(crate) config: WorkerConfig,
     pub(crate) devices: Vec<Executor>,
     pub(crate) contents: Contents,
+    pub(crate) spool: Spool,
     /// Unbounded for its senders, who must not wait; a device has at most six jobs, two events of each, and two an interruption.
     pub(crate) events: mpsc::UnboundedReceiver<DeviceEvent>,
     pub(crate) server: Arc<DataServer>,
@@ -96,7 +102,8 @@ struct Driver {
     links: HashMap<LinkId, Outbox>,
     devices: Vec<Device>,
     contents: Contents,
-    payloads: Payloads,
+    programs: Programs,
+    spool: Spool,
     /// Failures that the driver itself found, to be told to the machine in the next turn.
     found: Vec<Event>,
     registered: Option<oneshot::Sender<NodeId>>,
@@ -112,6 +119,7 @@ pub(crate) async fn drive(setup: Setup) -> End {
         config,
         devices,
         contents,
+        spool,
         mut events,
         server,
         session,
@@ -129,7 +137,8 @@ pub(crate) async fn drive(setup: Setup) -> End {
         serial: 0,
         links: HashMap::new(),
         devices: devices.into_iter().map(Device::new).collect(),
-        payloads: Payloads::default(),
+        programs: Programs::default(),
+        spool,
         found: Vec::new(),
         registered: Some(registered),
         end: None,
@@ -161,6 +170,9 @@ pub(crate) async fn drive(setup: Setup) -> End {
         }
         if let Some(figures) = driver.contents.news() {
             driver.tell(Event::CacheCounted(figures));
+        }
+        if let Some(full) = driver.spool.news() {
+            driver.tell(Event::SpoolFull(full));
         }
         driver.act_on_timers();
     };
@@ -221,7 +233,7 @@ impl Driver {
             }
             Input::CoordinatorSaid { .. } | Input::CoordinatorEnded { .. } => {}
             Input::LinkOpened { link, sender, peer } => {
-                self.links.insert(link, Outbox::new(sender, peer));
+                self.links.insert(link, Outbox::new(sender, peer, self.spool.clone(), self.inputs.clone()));
             }
             Input::AppSaid { link, frames } => {
                 for frame in frames {
@@ -240,6 +252,9 @@ impl Driver {
                 let events = self.contents.stored(content, result);
                 events.into_iter().for_each(|event| self.tell(event));
             }
+            // What it means is asked for after each turn.
+            Input::SpoolChanged => {}
+            Input::ResultLost { job } => self.tell(Event::ResultLost(job)),
             Input::Drain => self.tell(Event::DrainRequested),
         }
     }
@@ -317,7 +332,7 @@ impl Driver {
         if let Err(reason) = self.check_hello(link, &frame) {
             tracing::warn!(%link, reason, "an application was refused");
             if let Some(outbox) = self.links.remove(&link) {
-                outbox.send(NodeToApp::Refused { reason }, Vec::new());
+                outbox.send(NodeToApp::Refused { reason });
                 outbox.close("refused");
             }
             return;
@@ -326,7 +341,7 @@ impl Driver {
             match codec::unpack_programs(frame.payload, tickets.len()) {
                 Ok(programs) => {
                     for (ticket, program) in tickets.iter().zip(programs) {
-                        self.payloads.keep_program(ticket.job, program);
+                        self.programs.keep(ticket.job, program);
                     }
                 }
                 Err(error) => {
@@ -354,8 +369,8 @@ impl Driver {
                 let outcome = outcome.map(|payload| {
                     let lengths = payload.sections.iter().map(|section| section.len() as u64).collect();
                     // An aborted job's program is forgotten; its result must not stay behind.
-                    if self.payloads.program(job).is_some() {
-                        self.payloads.keep_result(job, payload.sections);
+                    if self.programs.discard(job).is_some() {
+                        self.spool.keep(job, payload.sections);
                     }
                     (lengths, payload.digest)
                 });
@@ -395,12 +410,8 @@ impl Driver {
         match effect {
             Effect::ToCoordinator(message) => self.send_to_coordinator(message),
             Effect::ToApp { link, message } => {
-                let payload = match &message {
-                    NodeToApp::Result(header) => self.payloads.result(header.job),
-                    NodeToApp::Welcome { .. } | NodeToApp::Refused { .. } => Vec::new(),
-                };
                 if let Some(outbox) = self.links.get(&link) {
-                    outbox.send(message, payload);
+                    outbox.send(message);
                 }
             }
             Effect::CloseApp { link } => {
@@ -415,7 +426,10 @@ impl Driver {
                     device.abort(job);
                 }
             }
-            Effect::Discard(job) => self.payloads.discard(job),
+            Effect::Discard(job) => {
+                self.programs.discard(job);
+                self.spool.discard(job);
+            }
             Effect::Release(hash) => self.contents.release(hash),
             Effect::Evict(contents) => self.found.extend(self.contents.evict(&contents)),
             // After a refusal the machine exits too; the refusal is the reason.
@@ -449,7 +463,7 @@ impl Driver {
     }
 
     fn execute(&mut self, job: JobAttempt, index: DeviceIndex, class: LatencyClass) {
-        let order = self.payloads.program(job).map(|program| {
+        let order = self.programs.get(job).map(|program| {
             let limit = self.options.job_limit;
             Order { job, class, program, limit }
         });

@@ -8,8 +8,9 @@ mod device;
 mod driver;
 mod executor;
 mod link;
-mod payload;
+mod programs;
 mod session;
+mod spool;
 
 use std::{net::SocketAddr, path::PathBuf, sync::Arc, time::Duration};
 
@@ -35,6 +36,7 @@ pub use self::executor::{Isolation, serve_if_executor};
 use self::{
     contents::Contents,
     driver::{Input, QUEUED_INPUTS, Setup},
+    spool::{Spool, SpoolRoom},
 };
 
 /// Most jobs a worker holds, executed and unacknowledged ones too; further ones go back to the coordinator.
@@ -61,6 +63,11 @@ pub struct WorkerOptions {
     pub content_cache_bytes: u64,
     /// Most bytes of results that an application may leave unacknowledged; beyond it no further job of it is begun.
     pub spool_quota_bytes: u64,
+    /// Bytes of results of all applications kept in memory; the oldest go to disk beyond it, if there is a cache folder.
+    pub spool_memory_bytes: u64,
+    /// Most bytes of results there. When both are full, an application gets a further job only while it leaves no result
+    /// unacknowledged.
+    pub spool_disk_bytes: u64,
     /// How long one job may run.
     pub job_limit: Duration,
     /// Whether an idle device takes queued jobs of its siblings; off only for measuring what that gains.
@@ -89,6 +96,8 @@ impl WorkerOptions {
             connect_timeout: Duration::from_secs(10),
             content_cache_bytes: 4 << 30,
             spool_quota_bytes: 1 << 30,
+            spool_memory_bytes: 1 << 30,
+            spool_disk_bytes: 16 << 30,
             job_limit: Duration::from_secs(600),
             local_stealing: true,
             share: Share::DEFAULT,
@@ -261,11 +270,16 @@ pub async fn start(options: WorkerOptions) -> Result<WorkerHandle, StartError> {
 
     let (inputs, received) = mpsc::channel(QUEUED_INPUTS);
     let (registered, registration) = oneshot::channel();
+    let room = SpoolRoom {
+        memory_bytes: options.spool_memory_bytes,
+        disk: options.cache.clone().map(|folder| (folder, options.spool_disk_bytes)),
+    };
     let setup = Setup {
         options: options.clone(),
         config,
         devices,
         contents,
+        spool: Spool::new(room, inputs.clone()),
         events,
         server,
         session,

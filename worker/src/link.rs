@@ -6,10 +6,9 @@ use std::{
     sync::{Arc, Mutex, PoisonError},
 };
 
-use bytes::Bytes;
 use farm_core::{
-    id::LinkId,
-    message::{AppToNode, Contact, NodeToApp},
+    id::{JobAttempt, LinkId},
+    message::{AppToNode, Contact, NodeToApp, ResultHeader},
     program::Content,
 };
 use proto::{
@@ -20,7 +19,7 @@ use proto::{
 };
 use tokio::sync::mpsc;
 
-use crate::driver::Input;
+use crate::{driver::Input, spool::Spool};
 
 /// Frames taken from a link at once.
 const FRAMES_PER_READ: usize = 64;
@@ -107,10 +106,10 @@ async fn read(
 }
 
 /// Frames that wait, in order; `None` while none does and nobody forwards.
-type Backlog = Mutex<Option<VecDeque<(NodeToApp, Vec<Bytes>)>>>;
+type Backlog = Mutex<Option<VecDeque<NodeToApp>>>;
 
 /// The writing side of a link: straight into its queue while that has room, else over a backlog that a task of its own
-/// works off in order.
+/// works off in order. A result's bytes stay in the spool until its turn.
 #[derive(Debug)]
 pub(crate) struct Outbox {
     sender: LinkSender<NodeToApp>,
@@ -120,11 +119,19 @@ pub(crate) struct Outbox {
     /// one step, or a frame could be left behind. Held for a push or a pop. At most one result of each job held
     /// waits here (`MAX_JOBS`).
     backlog: Arc<Backlog>,
+    spool: Spool,
+    /// Hears of results that cannot be read.
+    inputs: mpsc::Sender<Input>,
 }
 
 impl Outbox {
-    pub(crate) fn new(sender: LinkSender<NodeToApp>, peer: Option<Principal>) -> Self {
-        Self { sender, peer, backlog: Arc::new(Mutex::new(None)) }
+    pub(crate) fn new(
+        sender: LinkSender<NodeToApp>,
+        peer: Option<Principal>,
+        spool: Spool,
+        inputs: mpsc::Sender<Input>,
+    ) -> Self {
+        Self { sender, peer, backlog: Arc::new(Mutex::new(None)), spool, inputs }
     }
 
     /// Who is at the other end, in a secured farm.
@@ -138,20 +145,27 @@ impl Outbox {
     }
 
     /// Sends a frame, now or later. A link that is over drops it: what counts is sent again on the next link.
-    pub(crate) fn send(&self, header: NodeToApp, payload: Vec<Bytes>) {
+    pub(crate) fn send(&self, header: NodeToApp) {
         let mut backlog = self.backlog.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some(waiting) = backlog.as_mut() {
-            waiting.push_back((header, payload));
+            waiting.push_back(header);
             return;
         }
-        match self.sender.try_send(header, payload) {
-            Ok(()) => {}
-            Err(TrySendError::Full(header, payload)) => {
-                *backlog = Some(VecDeque::from([(header, payload)]));
-                tokio::spawn(forward(self.sender.clone(), Arc::clone(&self.backlog)));
+        let at_hand = match result_of(&header) {
+            Some(job) => self.spool.at_hand(job),
+            None => Some(Vec::new()),
+        };
+        let waits = match at_hand.map(|payload| self.sender.try_send(header.clone(), payload)) {
+            Some(Ok(())) => return,
+            Some(Err(TrySendError::Link(error))) => {
+                return tracing::debug!(%error, "a frame was dropped with its link");
             }
-            Err(TrySendError::Link(error)) => tracing::debug!(%error, "a frame was dropped with its link"),
-        }
+            Some(Err(TrySendError::Full(header, _))) => header,
+            None => header,
+        };
+        *backlog = Some(VecDeque::from([waits]));
+        let (sender, backlog) = (self.sender.clone(), Arc::clone(&self.backlog));
+        tokio::spawn(forward(sender, backlog, self.spool.clone(), self.inputs.clone()));
     }
 
     /// Closes the link once everything is sent.
@@ -160,7 +174,22 @@ impl Outbox {
     }
 }
 
-async fn forward(sender: LinkSender<NodeToApp>, backlog: Arc<Backlog>) {
+/// The job whose result goes with this header.
+fn result_of(header: &NodeToApp) -> Option<JobAttempt> {
+    match header {
+        NodeToApp::Result(ResultHeader { job, outcome: Ok(_), .. }) => Some(*job),
+        NodeToApp::Result(ResultHeader { outcome: Err(_), .. })
+        | NodeToApp::Welcome { .. }
+        | NodeToApp::Refused { .. } => None,
+    }
+}
+
+async fn forward(
+    sender: LinkSender<NodeToApp>,
+    backlog: Arc<Backlog>,
+    spool: Spool,
+    inputs: mpsc::Sender<Input>,
+) {
     loop {
         let next = {
             let mut backlog = backlog.lock().unwrap_or_else(PoisonError::into_inner);
@@ -170,7 +199,22 @@ async fn forward(sender: LinkSender<NodeToApp>, backlog: Arc<Backlog>) {
             }
             next
         };
-        let Some((header, payload)) = next else { return };
+        let Some(header) = next else { return };
+        let payload = match result_of(&header) {
+            None => Ok(Some(Vec::new())),
+            Some(job) => spool.read(job).await.map_err(|error| (job, error)),
+        };
+        let payload = match payload {
+            Ok(Some(payload)) => payload,
+            // It was acknowledged or cancelled while it waited.
+            Ok(None) => continue,
+            Err((job, error)) => {
+                tracing::error!(?job, %error, "a result cannot be read back from disk");
+                // Without a driver the worker has ended.
+                let _ = inputs.send(Input::ResultLost { job }).await;
+                continue;
+            }
+        };
         if let Err(error) = sender.send(header, payload).await {
             tracing::debug!(%error, "frames were dropped with their link");
             backlog.lock().unwrap_or_else(PoisonError::into_inner).take();

@@ -98,6 +98,10 @@ struct ConfigFile {
     disk_cache_bytes: Option<u64>,
     /// Most bytes of results that an application may leave unacknowledged.
     spool_quota_bytes: Option<u64>,
+    /// Bytes of results kept in memory, those of all applications together.
+    spool_memory_bytes: Option<u64>,
+    /// Most bytes of results kept in the cache folder, where memory has no room for them.
+    spool_disk_bytes: Option<u64>,
     /// How devices are shared between applications.
     #[serde(default)]
     share: Rule,
@@ -172,6 +176,8 @@ pub(crate) fn options(arguments: Arguments) -> anyhow::Result<WorkerOptions> {
         content_cache_bytes: file.content_cache_bytes.unwrap_or(defaults.content_cache_bytes),
         disk_cache_bytes: file.disk_cache_bytes.unwrap_or(defaults.disk_cache_bytes),
         spool_quota_bytes: file.spool_quota_bytes.unwrap_or(defaults.spool_quota_bytes),
+        spool_memory_bytes: file.spool_memory_bytes.unwrap_or(defaults.spool_memory_bytes),
+        spool_disk_bytes: file.spool_disk_bytes.unwrap_or(defaults.spool_disk_bytes),
         job_limit: duration("job_limit", file.job_limit, defaults.job_limit)?,
         local_stealing: file.scheduler.local_stealing == Switch::On,
         share: match file.share {
@@ -302,7 +308,8 @@ mod tests {
     fn flags_overrule_the_file() {
         let config = "coordinator = 'a:1'\nlisten = '127.0.0.1:5'\nadvertise = ['b:2']\nname = 'n'\n\
                       device = ['cpu', 'gpu:1']\ncache = '/c'\nconnect_timeout = '5m'\njob_limit = '250ms'\n\
-                      content_cache_bytes = 77\ndisk_cache_bytes = 79\nspool_quota_bytes = 78\nshare = 'stride'\n";
+                      content_cache_bytes = 77\ndisk_cache_bytes = 79\nspool_quota_bytes = 78\nspool_memory_bytes = 76\n\
+                      spool_disk_bytes = 75\nshare = 'stride'\n";
         let from_file = parse(&[], Some(config)).unwrap();
         assert_eq!((from_file.coordinator.as_str(), from_file.name.as_str()), ("a:1", "n"));
         assert_eq!(from_file.listen.to_string(), "127.0.0.1:5");
@@ -312,6 +319,7 @@ mod tests {
         assert_eq!(from_file.connect_timeout, Duration::from_secs(300));
         assert_eq!(from_file.job_limit, Duration::from_millis(250));
         assert_eq!((from_file.content_cache_bytes, from_file.spool_quota_bytes), (77, 78));
+        assert_eq!((from_file.spool_memory_bytes, from_file.spool_disk_bytes), (76, 75));
         assert_eq!(from_file.disk_cache_bytes, 79);
         assert!(from_file.local_stealing, "on unless it is switched off");
         assert_eq!(from_file.share, Share::Stride);

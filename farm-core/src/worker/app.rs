@@ -209,8 +209,9 @@ impl WorkerMachine {
 
     /// An application has a share while it has something to run and takes its results.
     pub(super) fn settle_share(&mut self, id: AppId) {
+        let quota_bytes = self.spool_quota_bytes();
         let Some(app) = self.apps.get_mut(&id) else { return };
-        let awake = app.active_jobs > 0 && app.takes_results(self.config.spool_quota_bytes);
+        let awake = app.active_jobs > 0 && app.takes_results(quota_bytes);
         match (std::mem::replace(&mut app.awake, awake), awake) {
             (false, true) => self.lags.wake(id),
             (true, false) => self.lags.rest(id),

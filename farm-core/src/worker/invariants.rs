@@ -74,7 +74,7 @@ impl WorkerMachine {
                 "waiting jobs of {index}"
             );
             let idle = !device.lost && device.handed_over.is_empty();
-            let quota_bytes = self.config.spool_quota_bytes;
+            let quota_bytes = self.spool_quota_bytes();
             let takes_results =
                 |app: &AppId| self.apps.get(app).is_some_and(|app| app.takes_results(quota_bytes));
             let waits = device.queues().keys().any(takes_results);
@@ -129,7 +129,7 @@ impl WorkerMachine {
             assert_eq!(active, app.active_jobs, "active jobs of {id}");
             let spooled = held.iter().map(|held| held.spooled_bytes()).sum::<u64>();
             assert_eq!(spooled, app.spool_bytes, "I8: the results of {id}");
-            let awake = active > 0 && app.takes_results(self.config.spool_quota_bytes);
+            let awake = active > 0 && app.takes_results(self.spool_quota_bytes());
             assert_eq!(app.awake, awake, "whether {id} has a share");
         }
         let known = self.jobs.keys().all(|job| self.apps.contains_key(&job.app));

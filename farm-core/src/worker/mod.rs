@@ -145,6 +145,11 @@ pub enum Event {
         /// `Ok`: lengths of the payload's sections and the payload's digest.
         outcome: Result<(Vec<u64>, ContentHash), JobFailure>,
     },
+    /// The driver has no room for further results, or has again: while it has none, an application gets a further job only
+    /// if it has left no result unacknowledged.
+    SpoolFull(bool),
+    /// The driver has lost the payload of an attempt that was executed.
+    ResultLost(JobAttempt),
     /// A device is gone for good.
     DeviceLost {
         /// Which.
@@ -249,6 +254,8 @@ pub struct WorkerMachine {
     reports: Reports,
     /// Results executed and not acknowledged, in bytes.
     spool_bytes: u64,
+    /// The driver has no room for more of them.
+    spool_full: bool,
     effects: VecDeque<Effect>,
 }
 
@@ -282,6 +289,7 @@ impl WorkerMachine {
             rng,
             reports: Reports::default(),
             spool_bytes: 0,
+            spool_full: false,
             effects: VecDeque::new(),
         }
     }
@@ -306,6 +314,8 @@ impl WorkerMachine {
             Event::Executed { job, device, device_time_ns, outcome } => {
                 self.executed(now, job, device, device_time_ns, outcome);
             }
+            Event::SpoolFull(full) => self.spool_filled(full),
+            Event::ResultLost(job) => self.result_lost(now, job),
             Event::DeviceLost { device, reason } => self.device_lost(now, device, &reason),
             Event::DrainRequested => self.start_drain(now),
         }

@@ -58,6 +58,26 @@ impl WorkerMachine {
         self.send_result(ack.job.job);
     }
 
+    /// What an application may leave unacknowledged before it gets no further job, in bytes.
+    pub(super) const fn spool_quota_bytes(&self) -> u64 {
+        if self.spool_full { 1 } else { self.config.spool_quota_bytes }
+    }
+
+    /// The driver has no room for further results, or has again.
+    pub(super) fn spool_filled(&mut self, full: bool) {
+        self.spool_full = full;
+        let apps: Vec<AppId> = self.apps.keys().copied().collect();
+        apps.into_iter().for_each(|app| self.settle_share(app));
+    }
+
+    /// A result cannot be sent any more: it is made again elsewhere.
+    pub(super) fn result_lost(&mut self, now: Instant, job: JobAttempt) {
+        let held = self.jobs.get(&job.job).filter(|held| held.attempt == job.attempt);
+        if held.is_some_and(|held| matches!(held.state, HeldState::Executed(_))) {
+            self.give_back(now, job);
+        }
+    }
+
     /// Sends everything unacknowledged on a new link.
     pub(super) fn resend_results(&mut self, app: AppId, link: LinkId) {
         for held in self.jobs.range(JobId::range_of(app)).map(|(_, held)| held) {

@@ -100,7 +100,7 @@ impl WorkerMachine {
         let counts_as = |app: AppId, first: &Rank| {
             if lags.had_too_much(app) { LatencyClass::Batch } else { first.class.0 }
         };
-        let (apps, quota_bytes) = (&self.apps, self.config.spool_quota_bytes);
+        let (apps, quota_bytes) = (&self.apps, self.spool_quota_bytes());
         let takes_results = |app: &AppId| apps.get(app).is_some_and(|app| app.takes_results(quota_bytes));
         let firsts = || {
             let queues = queues.iter().filter(|(app, _)| takes_results(app));

@@ -1,6 +1,6 @@
 //! Results that nobody takes: they cost their application its turn, and nobody else anything.
 
-use farm_core::{id::JobAttempt, message::LatencyClass};
+use farm_core::{id::JobAttempt, message::LatencyClass, worker::Event};
 
 use crate::node::Node;
 
@@ -46,4 +46,33 @@ fn an_application_that_takes_no_results_is_held_back_and_others_are_not() {
         seen += run_all(&mut node, RESULT_BYTES).len();
     }
     assert_eq!((seen, node.machine.held_jobs()), (20, 0), "nothing is lost");
+}
+
+#[test]
+fn while_the_spool_is_full_only_who_takes_results_gets_on() {
+    let mut node = Node::new(1, true, 2);
+    let slow = node.jobs(1, 0, 5, LatencyClass::Batch);
+    let ran = run_all(&mut node, 10);
+    assert_eq!(ran, slow, "50 B of 1,000");
+    node.tell(Event::SpoolFull(true));
+    let (slow, quick) = (node.jobs(1, 0, 5, LatencyClass::Batch), node.jobs(2, 0, 3, LatencyClass::Batch));
+    assert_eq!(run_all(&mut node, 10), quick[..2], "one, and one was staged by then; none of the other's");
+    quick[..2].iter().for_each(|job| node.acknowledge(*job));
+    assert_eq!(run_all(&mut node, 10), quick[2..], "it took its results");
+    assert!(node.orders().is_empty(), "the other still owes acknowledgements");
+    node.tell(Event::SpoolFull(false));
+    assert_eq!(run_all(&mut node, 10), slow, "there is room again");
+}
+
+#[test]
+fn a_result_that_the_driver_lost_is_made_again() {
+    let mut node = Node::new(1, true, 2);
+    let [first, second] = node.jobs(1, 0, 2, LatencyClass::Batch)[..] else { panic!("two were asked for") };
+    run_all(&mut node, 10);
+    node.tell(Event::ResultLost(first));
+    node.tell(Event::ResultLost(first));
+    assert_eq!(node.machine.held_jobs(), 1, "it is the coordinator's again");
+    node.acknowledge(second);
+    node.tell(Event::ResultLost(second));
+    assert_eq!(node.machine.held_jobs(), 0, "what is over stays over");
 }
