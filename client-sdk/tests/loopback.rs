@@ -229,6 +229,24 @@ async fn a_small_window_and_little_room_for_results_lose_nothing() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn results_wait_on_disk_where_memory_has_no_room_for_them() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut farm = TestFarm::start(0, &[]).await;
+    let cache = Some(folder.path().to_owned());
+    farm.add_worker(&["sim", "sim"], |options| WorkerOptions { spool_memory_bytes: 8, cache, ..options })
+        .await;
+    let window = Window { result_bytes: 1, ..Window::default() };
+    let app = Farm::connect(FarmOptions { window, ..farm.options() }).await.unwrap();
+    let brought = Brought::default();
+    let task = Echoes { jobs: 200, brought: Arc::clone(&brought), ..Echoes::default() };
+    assert_eq!(app.run(TaskGraph::new().task("echo", task)).await.unwrap().jobs, 200);
+    let brought: BTreeSet<u32> = brought.lock().unwrap().iter().copied().collect();
+    assert_eq!(brought, (0..200).collect());
+    app.close().await;
+    farm.stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn jobs_follow_their_results_and_tasks_their_graph() {
     let farm = TestFarm::simulated().await;
     let app = farm.connect().await;

@@ -3,6 +3,7 @@
 mod apart;
 mod book;
 mod here;
+mod mouth;
 mod process;
 mod restarts;
 mod serve;

@@ -23,8 +23,10 @@ use farm_core::{
 use gpu_exec::{Busy, DeviceSpec, Executor, ExecutorConfig, ExecutorEvent, Host, HungDevice, Order};
 use proto::codec;
 
-use super::wire::{self, FromExecutor, Header as _, LENGTH_BYTES, Output, ToExecutor};
-use crate::device::Payload;
+use super::{
+    mouth::Mouth,
+    wire::{self, FromExecutor, Header as _, LENGTH_BYTES, ToExecutor},
+};
 
 /// How long a content may take from the worker's memory to here; longer means that the worker has stopped.
 const CONTENT_WAIT: Duration = Duration::from_secs(60);
@@ -40,9 +42,7 @@ pub(super) fn serve(spec: &str) -> ExitCode {
     let Ok(socket) = io::stdin().as_fd().try_clone_to_owned().map(UnixStream::from) else {
         return ExitCode::from(EXIT_USAGE);
     };
-    let line =
-        Arc::new(Line { socket, writing: Mutex::default(), wish: Mutex::default(), news: Condvar::new() });
-    let done = run(spec, &line);
+    let done = Line::new(socket).and_then(|line| run(spec, &Arc::new(line)));
     end_soon();
     match done {
         Ok(()) => ExitCode::SUCCESS,
@@ -66,9 +66,9 @@ fn run(spec: &str, line: &Arc<Line>) -> io::Result<()> {
     open.store(true, Ordering::Relaxed);
     let executor = match opened {
         Ok(executor) => executor,
-        Err(reason) => return line.say(&FromExecutor::Refused(reason), &[]),
+        Err(reason) => return line.mouth.say(&FromExecutor::Refused(reason)),
     };
-    line.say(&FromExecutor::Opened(executor.info().clone()), &[])?;
+    line.mouth.say(&FromExecutor::Opened(executor.info().clone()))?;
     loop {
         match line.hear() {
             Ok((header, payload)) => take(&executor, line, header, payload)?,
@@ -93,7 +93,7 @@ fn take(executor: &Executor, line: &Line, header: ToExecutor, payload: Bytes) ->
                 Err(error) => Some(JobFailure::InvalidProgram(error.to_string())),
             };
             match failure {
-                Some(failure) => line.finished(job, 0, Err(failure)),
+                Some(failure) => line.mouth.finished(job, 0, Err(failure)),
                 None => Ok(()),
             }
         }
@@ -141,8 +141,7 @@ fn end_soon() {
 /// The socket to the worker.
 struct Line {
     socket: UnixStream,
-    /// One message at a time: the device's thread writes, and the one that reads.
-    writing: Mutex<()>,
+    mouth: Arc<Mouth>,
     /// The content that the device's thread waits for, in the middle of a job's preparation: hence a lock and a signal.
     wish: Mutex<Option<Wish>>,
     news: Condvar,
@@ -160,30 +159,31 @@ struct Speaker(Arc<Line>);
 
 impl Host for Speaker {
     fn event(&self, event: ExecutorEvent) {
+        let mouth = &self.0.mouth;
         let told = match event {
-            ExecutorEvent::Started { job } => self.0.say(&FromExecutor::Started(job), &[]),
-            ExecutorEvent::Yielded { job } => self.0.say(&FromExecutor::Yielded(job), &[]),
-            ExecutorEvent::Resumed { job } => self.0.say(&FromExecutor::Resumed(job), &[]),
+            ExecutorEvent::Started { job } => mouth.say(&FromExecutor::Started(job)),
+            ExecutorEvent::Yielded { job } => mouth.say(&FromExecutor::Yielded(job)),
+            ExecutorEvent::Resumed { job } => mouth.say(&FromExecutor::Resumed(job)),
             ExecutorEvent::Finished { job, device_time_ns, outcome } => {
-                self.0.finished(job, device_time_ns, outcome)
+                mouth.finished(job, device_time_ns, outcome)
             }
-            ExecutorEvent::Lost { reason } => self.0.say(&FromExecutor::Lost(reason), &[]),
+            ExecutorEvent::Lost { reason } => mouth.say(&FromExecutor::Lost(reason)),
         };
         // A worker that is gone is noticed by the thread that reads.
         let _ = told;
     }
 
     fn preparing(&self, job: JobAttempt) {
-        let _ = self.0.say(&FromExecutor::Preparing(job), &[]);
+        let _ = self.0.mouth.say(&FromExecutor::Preparing(job));
     }
 
     fn prepared(&self, job: JobAttempt) {
-        let _ = self.0.say(&FromExecutor::Prepared(job), &[]);
+        let _ = self.0.mouth.say(&FromExecutor::Prepared(job));
     }
 
     fn content(&self, hash: &ContentHash) -> Option<Bytes> {
         *self.0.wish() = Some(Wish { hash: *hash, answer: None });
-        self.0.say(&FromExecutor::Wants(*hash), &[]).ok()?;
+        self.0.mouth.say(&FromExecutor::Wants(*hash)).ok()?;
         let open = |wish: &mut Option<Wish>| wish.as_ref().is_some_and(|wish| wish.answer.is_none());
         let waited = self.0.news.wait_timeout_while(self.0.wish(), CONTENT_WAIT, open);
         let (mut wish, _) = waited.unwrap_or_else(PoisonError::into_inner);
@@ -192,28 +192,9 @@ impl Host for Speaker {
 }
 
 impl Line {
-    fn finished(
-        &self,
-        job: JobAttempt,
-        device_time_ns: u64,
-        outcome: Result<Vec<Bytes>, JobFailure>,
-    ) -> io::Result<()> {
-        let (outcome, sections) = match outcome.map(Payload::of) {
-            Ok(Payload { sections, digest }) => {
-                let lengths = sections.iter().map(|section| section.len() as u64).collect();
-                (Ok(Output { sections: lengths, digest }), sections)
-            }
-            Err(failure) => (Err(failure), Vec::new()),
-        };
-        self.say(&FromExecutor::Finished { job, device_time_ns, outcome }, &sections)
-    }
-
-    fn say(&self, header: &FromExecutor, payload: &[Bytes]) -> io::Result<()> {
-        let header = wire::encode(header);
-        let _one = self.writing.lock().unwrap_or_else(PoisonError::into_inner);
-        let mut socket = &self.socket;
-        socket.write_all(&header)?;
-        payload.iter().try_for_each(|part| socket.write_all(part))
+    fn new(socket: UnixStream) -> io::Result<Self> {
+        let mouth = Mouth::open(socket.try_clone()?)?;
+        Ok(Self { socket, mouth, wish: Mutex::default(), news: Condvar::new() })
     }
 
     fn hear(&self) -> io::Result<(ToExecutor, Bytes)> {
