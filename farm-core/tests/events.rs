@@ -404,6 +404,9 @@ fn ledger_event(step: Step) -> ledger::Event {
             job: JobId { app: AppId(1), task: TaskId(step.three.into()), index: JobIndex(step.one.into()) },
             failure: JobFailure::Poison("test".to_owned()),
         }),
+        21 if step.one == 0 => {
+            ledger::Event::FromCoordinator(CoordinatorToApp::Stopped { reason: "test".to_owned() })
+        }
         21 => ledger::Event::FromCoordinator(CoordinatorToApp::Waiting {
             batch: BatchId(step.one.into()),
             reason: WaitReason::NoNode,

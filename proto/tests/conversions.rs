@@ -122,6 +122,7 @@ fn failure() -> impl Strategy<Value = JobFailure> {
         "\\PC{0,80}".prop_map(JobFailure::OutOfMemory),
         any::<[u8; 32]>().prop_map(|hash| JobFailure::ContentUnavailable(ContentHash(hash))),
         "\\PC{0,80}".prop_map(JobFailure::Poison),
+        "\\PC{0,80}".prop_map(JobFailure::PoisonApplication),
         Just(JobFailure::Cancelled),
         Just(JobFailure::Returned),
     ]
@@ -210,6 +211,7 @@ fn coordinator_to_app() -> impl Strategy<Value = CoordinatorToApp> {
             let job = JobId { app: AppId(app), task: TaskId(task), index: JobIndex(index) };
             CoordinatorToApp::JobFailed { job, failure }
         }),
+        "\\PC{0,80}".prop_map(|reason| CoordinatorToApp::Stopped { reason }),
         any::<u64>().prop_map(|sequence| CoordinatorToApp::HeartbeatAck { sequence }),
         vec(any::<u8>(), 0..80).prop_map(CoordinatorToApp::Capability),
     ]

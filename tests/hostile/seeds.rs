@@ -81,6 +81,9 @@ pub(crate) const SEEDS: &[Seed] = &[
         let failure = JobFailure::DeviceLost("gone".to_owned());
         coordinator_to_app(CoordinatorToApp::JobFailed { job: attempt(1).job, failure })
     }),
+    ("coordinator_to_app", "valid-stopped", || {
+        coordinator_to_app(CoordinatorToApp::Stopped { reason: "8 in a row".to_owned() })
+    }),
     ("node_to_coordinator", "valid-hello", || {
         node_to_coordinator(NodeToCoordinator::Hello(NodeHello {
             protocol: 3,

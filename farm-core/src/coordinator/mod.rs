@@ -4,9 +4,11 @@
 //! ([`LinkId`]) and carries the effects out.
 //!
 //! Split by event family: `registry` (who is there), `placement` (where jobs go, by a `policy`; `consult` asks plug-ins),
-//! `report` (what ended), `replan` (what was lost), `steal` (what moves between nodes), `speculate` (what runs twice at the tail), `lease` (who is silent), `contents` (who has and brings which data), `status`
-//! (what operators see), `timeline` (what ran when and where). `model` holds the state they share, `rates` what devices are worth.
+//! `report` (what ended), `replan` (what was lost), `steal` (what moves between nodes), `speculate` (what runs twice at the tail),
+//! `breaker` (which application is stopped), `lease` (who is silent), `contents` (who has and brings which data), `status` (what
+//! operators see), `timeline` (what ran when and where). `model` holds the state they share, `rates` what devices are worth.
 
+mod breaker;
 mod consult;
 mod contents;
 mod invariants;

@@ -5,6 +5,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use super::{
     NodeState,
+    breaker::Breaker,
     policy::Policy,
     rates::{Load, Module, Modules, Throughput},
     recovery::Brought,
@@ -54,6 +55,7 @@ pub(super) struct App {
     pub(super) failed: BTreeMap<JobKey, JobFailure>,
     /// Nodes that its machine cannot reach, and until when that is believed.
     pub(super) unreachable: BTreeMap<NodeId, Instant>,
+    pub(super) breaker: Breaker,
     pub(super) waiting_jobs: u64,
     pub(super) delivered_jobs: u64,
     pub(super) device_time_ns: u64,

@@ -41,6 +41,10 @@ pub(super) const FETCH_NS_PER_BYTE: f64 = 1e9 / 117e6;
 impl CoordinatorMachine {
     pub(super) fn plan_requested(&mut self, now: Instant, id: AppId, request: PlanRequest) {
         let Some(app) = self.apps.get_mut(&id) else { return };
+        if let Some(reason) = app.breaker.reason(now) {
+            let reason = reason.to_owned();
+            return self.tell_app(id, CoordinatorToApp::Stopped { reason });
+        }
         if request.jobs.len() > MAX_REQUEST_JOBS || app.jobs.len() + request.jobs.len() > MAX_APP_JOBS {
             let reason = format!(
                 "a request holds at most {MAX_REQUEST_JOBS} jobs, an application at most {MAX_APP_JOBS} undelivered ones"

@@ -4,6 +4,7 @@ use std::{collections::BTreeMap, time::Duration};
 
 use super::{
     CoordinatorMachine, Effect, NodeState,
+    breaker::Breaker,
     model::{App, Node, Peer},
     policy::{FCFS, HISTORY, Policy},
     replan::Blame,
@@ -236,6 +237,7 @@ impl CoordinatorMachine {
             jobs: BTreeMap::new(),
             failed: BTreeMap::new(),
             unreachable: BTreeMap::new(),
+            breaker: Breaker::new(),
             waiting_jobs: 0,
             delivered_jobs: 0,
             device_time_ns: 0,

@@ -96,6 +96,7 @@ impl Ledger {
                 }
             }
             CoordinatorToApp::JobFailed { job, failure } => self.given_up(job, failure),
+            CoordinatorToApp::Stopped { reason } => self.stopped(&reason),
             CoordinatorToApp::HeartbeatAck { sequence: _ } | CoordinatorToApp::Capability(_) => {}
         }
     }

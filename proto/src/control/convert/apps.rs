@@ -163,6 +163,7 @@ impl From<CoordinatorToApp> for v1::CoordinatorToApp {
             CoordinatorToApp::JobFailed { job, failure } => {
                 Message::JobFailed(v1::JobFailed { job: Some(job.into()), failure: Some(failure.into()) })
             }
+            CoordinatorToApp::Stopped { reason } => Message::Stopped(v1::Stopped { reason: cut(reason) }),
             CoordinatorToApp::HeartbeatAck { sequence } => {
                 Message::HeartbeatAck(v1::HeartbeatAck { sequence })
             }
@@ -193,6 +194,7 @@ impl TryFrom<v1::CoordinatorToApp> for CoordinatorToApp {
                 job: required("JobFailed.job", failed.job)?.into(),
                 failure: required("JobFailed.failure", failed.failure)?.try_into()?,
             },
+            Message::Stopped(stopped) => Self::Stopped { reason: text("Stopped.reason", stopped.reason)? },
             Message::HeartbeatAck(v1::HeartbeatAck { sequence }) => Self::HeartbeatAck { sequence },
             Message::Capability(bytes) => {
                 within("CoordinatorToApp.capability", bytes.len(), MAX_CAPABILITY_BYTES)?;
