@@ -231,6 +231,8 @@ pub enum AppToCoordinator {
     Heartbeat {
         /// Echoed in the answer.
         sequence: u64,
+        /// No answer came for [`Liveness::suspect_ms`]: nothing gets through from there to here.
+        unanswered: bool,
     },
     /// No more jobs will come; everything of this application can be freed.
     Goodbye,
@@ -386,6 +388,8 @@ pub enum NodeToCoordinator {
     Heartbeat {
         /// Echoed in the answer.
         sequence: u64,
+        /// No answer came for [`Liveness::suspect_ms`]: nothing gets through from there to here.
+        unanswered: bool,
         /// By [`DeviceIndex`].
         devices: Vec<DeviceLoad>,
         /// Executed results not yet acknowledged, in bytes.

@@ -172,7 +172,8 @@ fn app_to_coordinator() -> impl Strategy<Value = AppToCoordinator> {
             session: NodeSession(session)
         }),
         any::<u32>().prop_map(|task| AppToCoordinator::Cancel(TaskId(task))),
-        any::<u64>().prop_map(|sequence| AppToCoordinator::Heartbeat { sequence }),
+        any::<(u64, bool)>()
+            .prop_map(|(sequence, unanswered)| AppToCoordinator::Heartbeat { sequence, unanswered }),
         Just(AppToCoordinator::Goodbye),
     ]
 }
@@ -253,9 +254,9 @@ fn node_to_coordinator() -> impl Strategy<Value = NodeToCoordinator> {
     });
     prop_oneof![
         hello,
-        (any::<(u64, u64)>(), vec(load, 0..9), option::of(cache())).prop_map(
-            |((sequence, spool_bytes), devices, cache)| {
-                NodeToCoordinator::Heartbeat { sequence, devices, spool_bytes, cache }
+        (any::<(u64, bool, u64)>(), vec(load, 0..9), option::of(cache())).prop_map(
+            |((sequence, unanswered, spool_bytes), devices, cache)| {
+                NodeToCoordinator::Heartbeat { sequence, unanswered, devices, spool_bytes, cache }
             }
         ),
         (vec(content(), 0..9), vec(content(), 0..9)).prop_map(|(held, gone)| {

@@ -99,8 +99,13 @@ pub(crate) const SEEDS: &[Seed] = &[
     ("node_to_coordinator", "valid-heartbeat", || {
         let running = Some(RunningJob { job: attempt(1), for_ns: 5_000 });
         let devices = vec![DeviceLoad { queued_jobs: 3, running }, DeviceLoad::default()];
-        let heartbeat =
-            NodeToCoordinator::Heartbeat { sequence: 9, devices, spool_bytes: 1 << 20, cache: Some(cache()) };
+        let heartbeat = NodeToCoordinator::Heartbeat {
+            sequence: 9,
+            unanswered: true,
+            devices,
+            spool_bytes: 1 << 20,
+            cache: Some(cache()),
+        };
         node_to_coordinator(heartbeat)
     }),
     ("node_to_coordinator", "valid-retracted", || {

@@ -435,6 +435,9 @@ impl CoordinatorMachine {
             (Some(Peer::App(app)), message) => (*app, message),
             (None | Some(Peer::Node(_)), _) => return self.protocol_error(now, link),
         };
+        if let AppToCoordinator::Heartbeat { unanswered, .. } = message {
+            self.app_hears(app, !unanswered);
+        }
         self.app_heard(now, app);
         match message {
             AppToCoordinator::Hello(_) => self.protocol_error(now, link),
@@ -442,7 +445,7 @@ impl CoordinatorMachine {
             AppToCoordinator::AlreadyDelivered(jobs) => self.already_delivered(app, &jobs),
             AppToCoordinator::Unreachable { node, session } => self.unreachable(now, app, node, session),
             AppToCoordinator::Cancel(task) => self.cancel_task(app, task),
-            AppToCoordinator::Heartbeat { sequence } => {
+            AppToCoordinator::Heartbeat { sequence, unanswered: _ } => {
                 self.tell_app(app, CoordinatorToApp::HeartbeatAck { sequence });
             }
             AppToCoordinator::Goodbye => {
@@ -458,10 +461,13 @@ impl CoordinatorMachine {
             (Some(Peer::Node(node)), message) => (*node, message),
             (None | Some(Peer::App(_)), _) => return self.protocol_error(now, link),
         };
+        if let NodeToCoordinator::Heartbeat { unanswered, .. } = message {
+            self.node_hears(node, !unanswered);
+        }
         self.node_heard(now, node);
         match message {
             NodeToCoordinator::Hello(_) => self.protocol_error(now, link),
-            NodeToCoordinator::Heartbeat { sequence, devices, spool_bytes: _, cache } => {
+            NodeToCoordinator::Heartbeat { sequence, unanswered: _, devices, spool_bytes: _, cache } => {
                 self.loads_reported(node, &devices, cache);
                 self.consider_speculating(now, node);
                 self.tell_node(node, CoordinatorToNode::HeartbeatAck { sequence });

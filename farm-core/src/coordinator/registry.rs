@@ -71,6 +71,7 @@ impl CoordinatorMachine {
         }
         let Some(node) = self.nodes.get_mut(&id) else { return };
         node.link = Some(link);
+        node.deaf = false;
         node.last_heard = now;
         node.full_until = None;
         node.contact = hello.contact.clone();
@@ -231,6 +232,7 @@ impl CoordinatorMachine {
             incarnation,
             link: Some(link),
             heard: false,
+            deaf: false,
             last_heard: now,
             lease_until: now,
             batches: BTreeMap::new(),
@@ -256,6 +258,7 @@ impl CoordinatorMachine {
     /// The connection was broken and stands again: repeats everything that may have been lost with the old one.
     fn app_comes_back(&mut self, now: Instant, link: LinkId, id: AppId) {
         let Some(app) = self.apps.get_mut(&id) else { return };
+        app.deaf = false;
         app.last_heard = now;
         if let Some(old) = app.link.replace(link) {
             self.close(old);

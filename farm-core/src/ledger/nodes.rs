@@ -238,7 +238,7 @@ impl Ledger {
     }
 
     pub(super) fn cancel_at_coordinator(&mut self, task: TaskId) {
-        if matches!(self.session, Session::Registered { .. }) {
+        if matches!(self.session, Session::Registered(_)) {
             self.tell_coordinator(AppToCoordinator::Cancel(task));
         }
     }
@@ -308,7 +308,7 @@ impl Ledger {
     }
 
     fn say_unreachable(&mut self, life: NodeLife) {
-        if matches!(self.session, Session::Registered { .. }) {
+        if matches!(self.session, Session::Registered(_)) {
             self.tell_coordinator(AppToCoordinator::Unreachable { node: life.node, session: life.session });
         }
     }

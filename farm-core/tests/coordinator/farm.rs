@@ -163,6 +163,21 @@ impl Farm {
         self.say(AppToCoordinator::Plan(request))
     }
 
+    /// A node or the application says whether its heartbeats are answered; 0 is the application.
+    pub(crate) fn says_unanswered(&mut self, who: u64, unanswered: bool) -> BTreeMap<u64, Vec<JobAttempt>> {
+        if who == APP.0 {
+            return self.say(AppToCoordinator::Heartbeat { sequence: 2, unanswered });
+        }
+        let message = NodeToCoordinator::Heartbeat {
+            sequence: 2,
+            unanswered,
+            devices: Vec::new(),
+            spool_bytes: 0,
+            cache: None,
+        };
+        self.handle(Event::FromNode { link: LinkId(who), message })
+    }
+
     /// A node says that it lives, and what its device has run for how many nanoseconds.
     pub(crate) fn heartbeat(
         &mut self,
@@ -173,6 +188,7 @@ impl Farm {
         let devices = vec![DeviceLoad { queued_jobs: 0, running }];
         let message = NodeToCoordinator::Heartbeat {
             sequence: 1,
+            unanswered: false,
             devices,
             spool_bytes: 0,
             cache: Some(CacheFigures::default()),
@@ -234,7 +250,7 @@ impl Farm {
 
     fn advance_to(&mut self, due: Instant) -> BTreeMap<u64, Vec<JobAttempt>> {
         self.now = self.now.max(due);
-        self.say(AppToCoordinator::Heartbeat { sequence: 1 });
+        self.say(AppToCoordinator::Heartbeat { sequence: 1, unanswered: false });
         let connected = self.machine.status().nodes;
         for node in connected.iter().filter(|node| node.state == NodeState::Alive) {
             let link: u64 = node.name.trim_start_matches("node ").parse().unwrap();
@@ -257,6 +273,13 @@ impl Farm {
         let executed = vec![Executed { job, device, device_time_ns, trace, failure }];
         let message = NodeToCoordinator::Report { sent_at: self.now, executed, delivered };
         self.handle(Event::FromNode { link: LinkId(node), message })
+    }
+
+    /// A node says that it has nothing to report.
+    pub(crate) fn ended_nothing(&mut self, node: u64) {
+        let message =
+            NodeToCoordinator::Report { sent_at: self.now, executed: Vec::new(), delivered: Vec::new() };
+        self.handle(Event::FromNode { link: LinkId(node), message });
     }
 
     /// A node has executed and delivered a job just now, in so many milliseconds.

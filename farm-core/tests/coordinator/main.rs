@@ -5,6 +5,7 @@
 mod breaker;
 mod farm;
 mod guard;
+mod hearing;
 mod losses;
 mod policies;
 mod speculation;

@@ -1300,6 +1300,9 @@ pub struct AppHeartbeat {
     /// Echoed in the answer.
     #[prost(uint64, tag = "1")]
     pub sequence: u64,
+    /// No answer came for as long as makes suspect: nothing gets through from there to here.
+    #[prost(bool, tag = "2")]
+    pub unanswered: bool,
 }
 /// Coordinator to application.
 #[derive(Clone, PartialEq, ::prost::Message)]
@@ -1827,6 +1830,9 @@ pub struct NodeHeartbeat {
     /// How the node's cache of contents stands.
     #[prost(message, optional, tag = "4")]
     pub cache: ::core::option::Option<CacheFigures>,
+    /// No answer came for as long as makes suspect: nothing gets through from there to here.
+    #[prost(bool, tag = "5")]
+    pub unanswered: bool,
 }
 /// How one device stands.
 #[derive(Clone, PartialEq, ::prost::Message)]

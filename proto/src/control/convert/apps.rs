@@ -26,7 +26,9 @@ impl From<AppToCoordinator> for v1::AppToCoordinator {
                 Message::Unreachable(v1::Unreachable { node: node.0, session: session.0 })
             }
             AppToCoordinator::Cancel(task) => Message::Cancel(v1::CancelTask { task: task.0 }),
-            AppToCoordinator::Heartbeat { sequence } => Message::Heartbeat(v1::AppHeartbeat { sequence }),
+            AppToCoordinator::Heartbeat { sequence, unanswered } => {
+                Message::Heartbeat(v1::AppHeartbeat { sequence, unanswered })
+            }
             AppToCoordinator::Goodbye => Message::Goodbye(v1::Nothing {}),
         };
         Self { message: Some(message) }
@@ -46,7 +48,9 @@ impl TryFrom<v1::AppToCoordinator> for AppToCoordinator {
                 Self::Unreachable { node: NodeId(node), session: NodeSession(session) }
             }
             Message::Cancel(v1::CancelTask { task }) => Self::Cancel(TaskId(task)),
-            Message::Heartbeat(v1::AppHeartbeat { sequence }) => Self::Heartbeat { sequence },
+            Message::Heartbeat(v1::AppHeartbeat { sequence, unanswered }) => {
+                Self::Heartbeat { sequence, unanswered }
+            }
             Message::Goodbye(v1::Nothing {}) => Self::Goodbye,
         })
     }
