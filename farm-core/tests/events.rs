@@ -466,6 +466,22 @@ fn judge_ledger(steps: &[Step]) {
     assert_eq!(counts.delivered_jobs + counts.failed_jobs, ended, "each end is told once");
 }
 
+/// The pause before the next try was over long after the time for all tries.
+#[test]
+fn a_try_that_comes_too_late_has_its_time_all_the_same() {
+    let step = Step { kind: 0, one: 0, two: 0, three: 0, four: 0, pause_ms: 0 };
+    judge_ledger(&[
+        step,
+        Step { kind: 1, ..step },
+        Step { kind: 4, one: 1, three: 1, ..step },
+        Step { kind: 6, two: 1, three: 1, ..step },
+        Step { kind: 10, two: 1, ..step },
+        Step { kind: 13, two: 1, ..step },
+        Step { kind: 12, two: 1, ..step },
+        Step { kind: 24, pause_ms: 10_000, ..step },
+    ]);
+}
+
 fn after(now: &mut Instant, step: Step) -> Instant {
     *now = Instant(now.0 + u64::from(step.pause_ms) * 1_000_000);
     *now
