@@ -222,6 +222,7 @@ fn describe_failure(failure: &JobFailure) -> String {
         JobFailure::OutOfMemory(reason) => format!("the device had no memory for it: {reason}"),
         JobFailure::ContentUnavailable(hash) => format!("content {hash} could not be fetched"),
         JobFailure::Poison(reason) => format!("too many attempts ended with their device or node: {reason}"),
+        JobFailure::PoisonApplication(reason) => format!("the farm stopped its application: {reason}"),
         JobFailure::Returned => "its node gave it back".to_owned(),
         JobFailure::Cancelled => "it was cancelled".to_owned(),
     }

@@ -366,7 +366,7 @@ mod tests {
             let said = [
                 Command::AppOpened(link, Peer::new(outbound, alive, None, None)),
                 Command::FromApp(link, AppToCoordinator::Hello(hello)),
-                Command::FromApp(link, AppToCoordinator::Heartbeat { sequence: 1 }),
+                Command::FromApp(link, AppToCoordinator::Heartbeat { sequence: 1, unanswered: false }),
             ];
             (said, outgoing, ended)
         };

@@ -106,6 +106,7 @@ async fn an_app_and_a_node_meet_through_sessions() {
     node.sender
         .try_send(NodeToCoordinator::Heartbeat {
             sequence: 9,
+            unanswered: false,
             devices: Vec::new(),
             spool_bytes: 0,
             cache: Some(CacheFigures::default()),

@@ -11,5 +11,6 @@ pub mod id;
 pub mod ledger;
 pub mod message;
 pub mod program;
+mod pulse;
 pub mod time;
 pub mod worker;

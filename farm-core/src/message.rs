@@ -184,6 +184,9 @@ pub enum JobFailure {
     ContentUnavailable(ContentHash),
     /// Too many attempts ended with the device or node (poison); the text is the last one's.
     Poison(String),
+    /// Too many attempts of the application's jobs in a row ended with their devices, and it was stopped as a whole; the text
+    /// names the last one.
+    PoisonApplication(String),
     /// Cancelled by the application or by an operator.
     Cancelled,
     /// The node gave the job back unexecuted (it drains, it is full, or the result could not be handed over intact).
@@ -201,7 +204,7 @@ impl JobFailure {
             | Self::OutOfMemory(_)
             | Self::ContentUnavailable(_)
             | Self::Returned => true,
-            Self::InvalidProgram(_) | Self::Poison(_) | Self::Cancelled => false,
+            Self::InvalidProgram(_) | Self::Poison(_) | Self::PoisonApplication(_) | Self::Cancelled => false,
         }
     }
 }
@@ -228,6 +231,8 @@ pub enum AppToCoordinator {
     Heartbeat {
         /// Echoed in the answer.
         sequence: u64,
+        /// No answer came for [`Liveness::suspect_ms`]: nothing gets through from there to here.
+        unanswered: bool,
     },
     /// No more jobs will come; everything of this application can be freed.
     Goodbye,
@@ -267,6 +272,11 @@ pub enum CoordinatorToApp {
         job: JobId,
         /// Why.
         failure: JobFailure,
+    },
+    /// The coordinator gave all jobs up ([`JobFailure::PoisonApplication`]), and plans none for a while.
+    Stopped {
+        /// Why, for people.
+        reason: String,
     },
     /// Answer to a heartbeat.
     HeartbeatAck {
@@ -378,6 +388,8 @@ pub enum NodeToCoordinator {
     Heartbeat {
         /// Echoed in the answer.
         sequence: u64,
+        /// No answer came for [`Liveness::suspect_ms`]: nothing gets through from there to here.
+        unanswered: bool,
         /// By [`DeviceIndex`].
         devices: Vec<DeviceLoad>,
         /// Executed results not yet acknowledged, in bytes.

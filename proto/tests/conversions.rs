@@ -122,6 +122,7 @@ fn failure() -> impl Strategy<Value = JobFailure> {
         "\\PC{0,80}".prop_map(JobFailure::OutOfMemory),
         any::<[u8; 32]>().prop_map(|hash| JobFailure::ContentUnavailable(ContentHash(hash))),
         "\\PC{0,80}".prop_map(JobFailure::Poison),
+        "\\PC{0,80}".prop_map(JobFailure::PoisonApplication),
         Just(JobFailure::Cancelled),
         Just(JobFailure::Returned),
     ]
@@ -171,7 +172,8 @@ fn app_to_coordinator() -> impl Strategy<Value = AppToCoordinator> {
             session: NodeSession(session)
         }),
         any::<u32>().prop_map(|task| AppToCoordinator::Cancel(TaskId(task))),
-        any::<u64>().prop_map(|sequence| AppToCoordinator::Heartbeat { sequence }),
+        any::<(u64, bool)>()
+            .prop_map(|(sequence, unanswered)| AppToCoordinator::Heartbeat { sequence, unanswered }),
         Just(AppToCoordinator::Goodbye),
     ]
 }
@@ -210,6 +212,7 @@ fn coordinator_to_app() -> impl Strategy<Value = CoordinatorToApp> {
             let job = JobId { app: AppId(app), task: TaskId(task), index: JobIndex(index) };
             CoordinatorToApp::JobFailed { job, failure }
         }),
+        "\\PC{0,80}".prop_map(|reason| CoordinatorToApp::Stopped { reason }),
         any::<u64>().prop_map(|sequence| CoordinatorToApp::HeartbeatAck { sequence }),
         vec(any::<u8>(), 0..80).prop_map(CoordinatorToApp::Capability),
     ]
@@ -251,9 +254,9 @@ fn node_to_coordinator() -> impl Strategy<Value = NodeToCoordinator> {
     });
     prop_oneof![
         hello,
-        (any::<(u64, u64)>(), vec(load, 0..9), option::of(cache())).prop_map(
-            |((sequence, spool_bytes), devices, cache)| {
-                NodeToCoordinator::Heartbeat { sequence, devices, spool_bytes, cache }
+        (any::<(u64, bool, u64)>(), vec(load, 0..9), option::of(cache())).prop_map(
+            |((sequence, unanswered, spool_bytes), devices, cache)| {
+                NodeToCoordinator::Heartbeat { sequence, unanswered, devices, spool_bytes, cache }
             }
         ),
         (vec(content(), 0..9), vec(content(), 0..9)).prop_map(|(held, gone)| {

@@ -81,6 +81,9 @@ pub(crate) const SEEDS: &[Seed] = &[
         let failure = JobFailure::DeviceLost("gone".to_owned());
         coordinator_to_app(CoordinatorToApp::JobFailed { job: attempt(1).job, failure })
     }),
+    ("coordinator_to_app", "valid-stopped", || {
+        coordinator_to_app(CoordinatorToApp::Stopped { reason: "8 in a row".to_owned() })
+    }),
     ("node_to_coordinator", "valid-hello", || {
         node_to_coordinator(NodeToCoordinator::Hello(NodeHello {
             protocol: 3,
@@ -96,8 +99,13 @@ pub(crate) const SEEDS: &[Seed] = &[
     ("node_to_coordinator", "valid-heartbeat", || {
         let running = Some(RunningJob { job: attempt(1), for_ns: 5_000 });
         let devices = vec![DeviceLoad { queued_jobs: 3, running }, DeviceLoad::default()];
-        let heartbeat =
-            NodeToCoordinator::Heartbeat { sequence: 9, devices, spool_bytes: 1 << 20, cache: Some(cache()) };
+        let heartbeat = NodeToCoordinator::Heartbeat {
+            sequence: 9,
+            unanswered: true,
+            devices,
+            spool_bytes: 1 << 20,
+            cache: Some(cache()),
+        };
         node_to_coordinator(heartbeat)
     }),
     ("node_to_coordinator", "valid-retracted", || {

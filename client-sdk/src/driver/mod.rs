@@ -329,6 +329,7 @@ impl Driver {
             CoordinatorToApp::Refused { .. }
             | CoordinatorToApp::Waiting { .. }
             | CoordinatorToApp::JobFailed { .. }
+            | CoordinatorToApp::Stopped { .. }
             | CoordinatorToApp::HeartbeatAck { .. }
             | CoordinatorToApp::Capability(_) => {}
         }

@@ -17,14 +17,36 @@ const LEAST_GUARDED_NODES: usize = 4;
 
 impl CoordinatorMachine {
     pub(super) fn app_heard(&mut self, now: Instant, id: AppId) {
-        if let Some(app) = self.apps.get_mut(&id) {
+        let Some(app) = self.apps.get_mut(&id) else { return };
+        app.heard = true;
+        if !app.deaf {
             app.last_heard = now;
-            app.heard = true;
+        }
+    }
+
+    /// An application says whether it is answered. While it is not, it gets no plans that it would not hear of.
+    pub(super) fn app_hears(&mut self, id: AppId, hears: bool) {
+        let Some(app) = self.apps.get_mut(&id) else { return };
+        let was_deaf = std::mem::replace(&mut app.deaf, !hears);
+        if was_deaf && hears {
+            self.retry_stuck();
+        }
+    }
+
+    /// A node says whether it is answered.
+    pub(super) fn node_hears(&mut self, id: NodeId, hears: bool) {
+        let Some(node) = self.nodes.get_mut(&id) else { return };
+        node.deaf = !hears;
+        if node.deaf {
+            suspect(node);
         }
     }
 
     pub(super) fn node_heard(&mut self, now: Instant, id: NodeId) {
         let Some(node) = self.nodes.get_mut(&id) else { return };
+        if node.deaf {
+            return;
+        }
         node.last_heard = now;
         if node.state == NodeState::Suspect {
             node.state = NodeState::Alive;

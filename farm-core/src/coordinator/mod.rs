@@ -4,9 +4,11 @@
 //! ([`LinkId`]) and carries the effects out.
 //!
 //! Split by event family: `registry` (who is there), `placement` (where jobs go, by a `policy`; `consult` asks plug-ins),
-//! `report` (what ended), `replan` (what was lost), `steal` (what moves between nodes), `speculate` (what runs twice at the tail), `lease` (who is silent), `contents` (who has and brings which data), `status`
-//! (what operators see), `timeline` (what ran when and where). `model` holds the state they share, `rates` what devices are worth.
+//! `report` (what ended), `replan` (what was lost), `steal` (what moves between nodes), `speculate` (what runs twice at the tail),
+//! `breaker` (which application is stopped), `lease` (who is silent), `contents` (who has and brings which data), `status` (what
+//! operators see), `timeline` (what ran when and where). `model` holds the state they share, `rates` what devices are worth.
 
+mod breaker;
 mod consult;
 mod contents;
 mod invariants;
@@ -433,6 +435,9 @@ impl CoordinatorMachine {
             (Some(Peer::App(app)), message) => (*app, message),
             (None | Some(Peer::Node(_)), _) => return self.protocol_error(now, link),
         };
+        if let AppToCoordinator::Heartbeat { unanswered, .. } = message {
+            self.app_hears(app, !unanswered);
+        }
         self.app_heard(now, app);
         match message {
             AppToCoordinator::Hello(_) => self.protocol_error(now, link),
@@ -440,7 +445,7 @@ impl CoordinatorMachine {
             AppToCoordinator::AlreadyDelivered(jobs) => self.already_delivered(app, &jobs),
             AppToCoordinator::Unreachable { node, session } => self.unreachable(now, app, node, session),
             AppToCoordinator::Cancel(task) => self.cancel_task(app, task),
-            AppToCoordinator::Heartbeat { sequence } => {
+            AppToCoordinator::Heartbeat { sequence, unanswered: _ } => {
                 self.tell_app(app, CoordinatorToApp::HeartbeatAck { sequence });
             }
             AppToCoordinator::Goodbye => {
@@ -456,10 +461,13 @@ impl CoordinatorMachine {
             (Some(Peer::Node(node)), message) => (*node, message),
             (None | Some(Peer::App(_)), _) => return self.protocol_error(now, link),
         };
+        if let NodeToCoordinator::Heartbeat { unanswered, .. } = message {
+            self.node_hears(node, !unanswered);
+        }
         self.node_heard(now, node);
         match message {
             NodeToCoordinator::Hello(_) => self.protocol_error(now, link),
-            NodeToCoordinator::Heartbeat { sequence, devices, spool_bytes: _, cache } => {
+            NodeToCoordinator::Heartbeat { sequence, unanswered: _, devices, spool_bytes: _, cache } => {
                 self.loads_reported(node, &devices, cache);
                 self.consider_speculating(now, node);
                 self.tell_node(node, CoordinatorToNode::HeartbeatAck { sequence });

@@ -5,6 +5,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use super::{
     NodeState,
+    breaker::Breaker,
     policy::Policy,
     rates::{Load, Module, Modules, Throughput},
     recovery::Brought,
@@ -44,6 +45,8 @@ pub(super) struct App {
     pub(super) link: Option<LinkId>,
     /// It said something since it was told its incarnation.
     pub(super) heard: bool,
+    /// It says that it hears nothing from here: until it does it counts as silent, whatever it says.
+    pub(super) deaf: bool,
     pub(super) last_heard: Instant,
     pub(super) lease_until: Instant,
     /// Batches with jobs in `jobs`.
@@ -54,6 +57,7 @@ pub(super) struct App {
     pub(super) failed: BTreeMap<JobKey, JobFailure>,
     /// Nodes that its machine cannot reach, and until when that is believed.
     pub(super) unreachable: BTreeMap<NodeId, Instant>,
+    pub(super) breaker: Breaker,
     pub(super) waiting_jobs: u64,
     pub(super) delivered_jobs: u64,
     pub(super) device_time_ns: u64,
@@ -157,6 +161,8 @@ pub(super) struct Node {
     pub(super) devices: Vec<Device>,
     /// `None` since `last_heard` when the connection is gone.
     pub(super) link: Option<LinkId>,
+    /// It says that it hears nothing from here: until it does it counts as silent, whatever it says.
+    pub(super) deaf: bool,
     pub(super) last_heard: Instant,
     pub(super) state: NodeState,
     /// Gave a job back while not draining: gets nothing new until then.
@@ -186,6 +192,7 @@ impl Node {
             contact: hello.contact.clone(),
             devices: hello.devices.iter().cloned().map(|info| Device::new(info, now)).collect(),
             link: None,
+            deaf: false,
             last_heard: now,
             state: NodeState::Alive,
             full_until: None,

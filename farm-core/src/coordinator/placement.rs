@@ -41,6 +41,10 @@ pub(super) const FETCH_NS_PER_BYTE: f64 = 1e9 / 117e6;
 impl CoordinatorMachine {
     pub(super) fn plan_requested(&mut self, now: Instant, id: AppId, request: PlanRequest) {
         let Some(app) = self.apps.get_mut(&id) else { return };
+        if let Some(reason) = app.breaker.reason(now) {
+            let reason = reason.to_owned();
+            return self.tell_app(id, CoordinatorToApp::Stopped { reason });
+        }
         if request.jobs.len() > MAX_REQUEST_JOBS || app.jobs.len() + request.jobs.len() > MAX_APP_JOBS {
             let reason = format!(
                 "a request holds at most {MAX_REQUEST_JOBS} jobs, an application at most {MAX_APP_JOBS} undelivered ones"
@@ -171,8 +175,9 @@ impl CoordinatorMachine {
         if jobs.is_empty() {
             return None;
         }
-        // While its application is away a job could not be sent: it would only fill up a device's queue.
-        let devices = if app.link.is_some() { self.candidates(now, app, batch) } else { Vec::new() };
+        // While its application does not hear of it a job could not be sent: it would only fill up a device's queue.
+        let devices =
+            if app.link.is_some() && !app.deaf { self.candidates(now, app, batch) } else { Vec::new() };
         if devices.is_empty() {
             pending.keys =
                 jobs.into_iter().map(|job| JobKey { task: batch.task, index: job.index }).collect();
@@ -310,7 +315,9 @@ impl CoordinatorMachine {
             true => WaitReason::NoFittingDevice,
             false => WaitReason::NoNode,
         };
-        let Some(app) = self.apps.get_mut(&id).filter(|app| app.link.is_some()) else { return };
+        let Some(app) = self.apps.get_mut(&id).filter(|app| app.link.is_some() && !app.deaf) else {
+            return;
+        };
         let Some(waiting) = app.batches.get_mut(&batch) else { return };
         if waiting.told.replace(reason) != Some(reason) {
             self.tell_app(id, CoordinatorToApp::Waiting { batch, reason });

@@ -4,6 +4,7 @@ use std::{collections::BTreeMap, time::Duration};
 
 use super::{
     CoordinatorMachine, Effect, NodeState,
+    breaker::Breaker,
     model::{App, Node, Peer},
     policy::{FCFS, HISTORY, Policy},
     replan::Blame,
@@ -70,6 +71,7 @@ impl CoordinatorMachine {
         }
         let Some(node) = self.nodes.get_mut(&id) else { return };
         node.link = Some(link);
+        node.deaf = false;
         node.last_heard = now;
         node.full_until = None;
         node.contact = hello.contact.clone();
@@ -230,12 +232,14 @@ impl CoordinatorMachine {
             incarnation,
             link: Some(link),
             heard: false,
+            deaf: false,
             last_heard: now,
             lease_until: now,
             batches: BTreeMap::new(),
             jobs: BTreeMap::new(),
             failed: BTreeMap::new(),
             unreachable: BTreeMap::new(),
+            breaker: Breaker::new(),
             waiting_jobs: 0,
             delivered_jobs: 0,
             device_time_ns: 0,
@@ -254,6 +258,7 @@ impl CoordinatorMachine {
     /// The connection was broken and stands again: repeats everything that may have been lost with the old one.
     fn app_comes_back(&mut self, now: Instant, link: LinkId, id: AppId) {
         let Some(app) = self.apps.get_mut(&id) else { return };
+        app.deaf = false;
         app.last_heard = now;
         if let Some(old) = app.link.replace(link) {
             self.close(old);

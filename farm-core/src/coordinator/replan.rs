@@ -193,6 +193,12 @@ impl CoordinatorMachine {
         let Some(app) = self.apps.get(&id) else { return };
         let jobs: Vec<JobId> =
             app.jobs.range(JobKey::range_of(task)).map(|(key, _)| key.in_app(id)).collect();
+        self.withdraw(jobs);
+        self.forget_waiting(id, task);
+    }
+
+    /// Forgets jobs, and has nodes drop what they hold of them.
+    pub(super) fn withdraw(&mut self, jobs: Vec<JobId>) {
         let mut on_nodes: BTreeMap<NodeId, Vec<JobAttempt>> = BTreeMap::new();
         for job in jobs {
             self.drop_backup(job);
@@ -201,7 +207,6 @@ impl CoordinatorMachine {
             }
             self.forget_job(job);
         }
-        self.forget_waiting(id, task);
         for (node, jobs) in on_nodes {
             self.tell_node(node, CoordinatorToNode::Cancel { jobs });
         }

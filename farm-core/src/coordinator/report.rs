@@ -82,7 +82,10 @@ impl CoordinatorMachine {
         let job = JobAttempt { job: id, attempt };
         if self.is_backup(job, node) {
             match failure {
-                Some(failure) if failure.can_be_retried() => return self.backup_failed(id, failure, node),
+                Some(failure) if failure.can_be_retried() => {
+                    self.backup_failed(id, failure.clone(), node);
+                    return self.app_crashed(now, (node, device), job, &failure);
+                }
                 Some(_) | None => self.first_one_loses(id),
             }
         }
@@ -105,7 +108,10 @@ impl CoordinatorMachine {
                 self.requeue(id, Some(node));
             }
             Some(JobFailure::ContentUnavailable(content)) => self.starved(now, id, content, node),
-            Some(failure) if failure.can_be_retried() => self.crashed(id, failure, node),
+            Some(failure) if failure.can_be_retried() => {
+                self.crashed(id, failure.clone(), node);
+                self.app_crashed(now, (node, device), job, &failure);
+            }
             // Its application gets this failure from the node, as a result; nothing else is owed.
             Some(_) => {
                 self.drop_backup(id);
@@ -166,6 +172,7 @@ impl CoordinatorMachine {
         let point_ns = device.completed(now, &mut self.modules, load, device_time_ns);
         let Some(app) = self.apps.get_mut(&job.app) else { return };
         app.device_time_ns = app.device_time_ns.saturating_add(device_time_ns);
+        app.breaker.completed();
         if app.policy == Policy::History {
             self.history.note(&app.name, job.index, point_ns);
         }

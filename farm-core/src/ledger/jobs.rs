@@ -150,15 +150,14 @@ impl Ledger {
         if keys.is_empty() {
             return;
         }
-        // Before the first registration there is no application id yet; the driver keys programs by task and index.
-        let app = self.app().unwrap_or(AppId(0));
-        for key in keys {
-            if let Some(placements) = self.jobs.get(&key).map(Job::placements) {
-                self.stop(key.in_app(app), placements);
-            }
-            self.fail(key, key.in_app(app), JobFailure::Cancelled);
-        }
+        self.fail_all(keys, &JobFailure::Cancelled);
         self.cancel_at_coordinator(task);
+    }
+
+    /// The coordinator gave every job up.
+    pub(super) fn stopped(&mut self, reason: &str) {
+        let keys: Vec<JobKey> = self.jobs.keys().copied().collect();
+        self.fail_all(keys, &JobFailure::PoisonApplication(reason.to_owned()));
     }
 
     /// Forgets every placement: the attempts can never be answered.
@@ -262,6 +261,18 @@ impl Ledger {
     fn stop(&mut self, job: JobId, placements: impl Iterator<Item = Placement>) {
         for place in placements {
             self.cancel_on_node(place.life, JobAttempt { job, attempt: place.attempt });
+        }
+    }
+
+    /// Open jobs fail, wherever they are.
+    fn fail_all(&mut self, keys: Vec<JobKey>, failure: &JobFailure) {
+        // Before the first registration there is no application id yet; the driver keys programs by task and index.
+        let app = self.app().unwrap_or(AppId(0));
+        for key in keys {
+            if let Some(placements) = self.jobs.get(&key).map(Job::placements) {
+                self.stop(key.in_app(app), placements);
+            }
+            self.fail(key, key.in_app(app), failure.clone());
         }
     }
 

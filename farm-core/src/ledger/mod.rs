@@ -25,7 +25,7 @@ use crate::{
     },
     message::{
         AppHello, AppToCoordinator, AppToNode, Contact, CoordinatorToApp, CostNs, JobFailure, LatencyClass,
-        Liveness, NodeToApp, Priority, WaitReason,
+        NodeToApp, Priority, WaitReason,
     },
     program::Content,
     time::Instant,
@@ -189,7 +189,6 @@ pub struct Ledger {
     hello: AppHello,
     session: Session,
     identity: Option<Identity>,
-    liveness: Liveness,
     heartbeat_sequence: u64,
     /// Jobs that may still be delivered or fail.
     jobs: BTreeMap<JobKey, Job>,
@@ -222,7 +221,6 @@ impl Ledger {
             hello,
             session: Session::Offline,
             identity,
-            liveness: Liveness::default(),
             heartbeat_sequence: 0,
             jobs: BTreeMap::new(),
             over: BTreeSet::new(),

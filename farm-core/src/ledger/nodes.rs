@@ -25,8 +25,12 @@ const BACKOFF_MS: u64 = 50;
 /// Most connection tries in a row before the node counts as unreachable from here.
 const MAX_CONNECT_TRIES: u32 = 6;
 
-/// Longest time without a link before the node counts as unreachable from here, in milliseconds.
-const MAX_RECONNECT_MS: u64 = 10_000;
+/// Longest time without a first link before the node counts as unreachable from here, in milliseconds.
+const MAX_CONNECT_MS: u64 = 10_000;
+
+/// And without a link that stood before. A silent one is lost after 6 s (`proto/src/link/connect.rs`): jobs move off a node that
+/// their application cannot reach within the node's own lease of 10 s.
+const MAX_RECONNECT_MS: u64 = 3_500;
 
 /// One life of a node: what links are keyed by.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -57,14 +61,23 @@ pub(super) struct Node {
     pub(super) link: Link,
     /// Tries since the link last stood.
     tries: u32,
-    /// Since when there is no link.
-    down_since: Instant,
+    /// Until when a link is tried for.
+    try_until: Instant,
     /// Attempts there that have no result yet.
     pub(super) outstanding: BTreeMap<Attempt, JobKey>,
     /// Those of them to be sent on the current link, in plan order.
     unsent: VecDeque<Attempt>,
     acks: Vec<ResultAck>,
     cancels: Vec<JobAttempt>,
+}
+
+impl Node {
+    /// When a try that begins now, or a greeting, has failed without an answer. One that begins too late, because the timer
+    /// did, has its time all the same.
+    fn answer_by(&self, now: Instant) -> Instant {
+        let timeout = now.after(Duration::from_millis(CONNECT_TIMEOUT_MS));
+        if self.try_until > now { timeout.min(self.try_until) } else { timeout }
+    }
 }
 
 impl Ledger {
@@ -93,7 +106,7 @@ impl Ledger {
         if wanted {
             node.contact = contact;
             node.tries = 0;
-            node.down_since = now;
+            node.try_until = now.after(Duration::from_millis(MAX_CONNECT_MS));
             self.connect(now, life);
             self.close_older_lives(life);
         }
@@ -105,7 +118,7 @@ impl Ledger {
             contact: Contact { addresses: Vec::new(), certificate_der: Vec::new() },
             link: Link::Unreachable,
             tries: 0,
-            down_since: Instant::ZERO,
+            try_until: Instant::ZERO,
             outstanding: BTreeMap::new(),
             unsent: VecDeque::new(),
             acks: Vec::new(),
@@ -130,7 +143,7 @@ impl Ledger {
             return;
         };
         node.link = Link::Greeting;
-        self.deadlines.insert(life, now.after(Duration::from_millis(CONNECT_TIMEOUT_MS)));
+        self.deadlines.insert(life, node.answer_by(now));
         let hello = AppToNode::Hello {
             protocol: PROTOCOL_VERSION,
             app: identity.app,
@@ -153,13 +166,12 @@ impl Ledger {
         match node.link {
             Link::Open => {
                 node.tries = 0;
-                node.down_since = now;
+                node.try_until = now.after(Duration::from_millis(MAX_RECONNECT_MS));
             }
             Link::Connecting | Link::Greeting => {}
             Link::Backoff | Link::Unreachable => return,
         }
-        let silent = now.since(node.down_since) >= Duration::from_millis(MAX_RECONNECT_MS);
-        if node.tries >= MAX_CONNECT_TRIES || silent {
+        if node.tries >= MAX_CONNECT_TRIES || node.try_until <= now {
             node.link = Link::Unreachable;
             node.unsent.clear();
             self.deadlines.remove(&life);
@@ -238,7 +250,7 @@ impl Ledger {
     }
 
     pub(super) fn cancel_at_coordinator(&mut self, task: TaskId) {
-        if matches!(self.session, Session::Registered { .. }) {
+        if matches!(self.session, Session::Registered(_)) {
             self.tell_coordinator(AppToCoordinator::Cancel(task));
         }
     }
@@ -267,7 +279,7 @@ impl Ledger {
         node.link = Link::Connecting;
         node.tries += 1;
         let contact = node.contact.clone();
-        self.deadlines.insert(life, now.after(Duration::from_millis(CONNECT_TIMEOUT_MS)));
+        self.deadlines.insert(life, node.answer_by(now));
         self.push(Effect::Connect { node: life.node, session: life.session, contact });
     }
 
@@ -308,7 +320,7 @@ impl Ledger {
     }
 
     fn say_unreachable(&mut self, life: NodeLife) {
-        if matches!(self.session, Session::Registered { .. }) {
+        if matches!(self.session, Session::Registered(_)) {
             self.tell_coordinator(AppToCoordinator::Unreachable { node: life.node, session: life.session });
         }
     }

@@ -1,13 +1,14 @@
 //! The ledger's talk with the coordinator: registration, resumption, heartbeats, plan requests. It never touches a
 //! node's link.
 
-use std::{collections::BTreeSet, time::Duration};
+use std::collections::BTreeSet;
 
 use super::{Effect, Ledger};
 use crate::{
     id::{AppId, AppIncarnation, BatchId, JobId, JobKey},
     message::{AppHello, AppToCoordinator, CoordinatorToApp, HeldJob, Liveness, PlanJob, PlanRequest},
     program::Content,
+    pulse::{Answers, Pulse},
     time::Instant,
 };
 
@@ -29,10 +30,7 @@ pub(super) enum Session {
     /// Hello said, no welcome yet.
     Greeting,
     /// Welcome.
-    Registered {
-        /// When to say that we are alive.
-        next_heartbeat: Instant,
-    },
+    Registered(Pulse),
     /// The coordinator wants nothing of us.
     Refused,
     /// Goodbye said.
@@ -41,9 +39,9 @@ pub(super) enum Session {
 
 impl Session {
     /// The timer of this state.
-    pub(super) const fn next_heartbeat(self) -> Option<Instant> {
+    pub(super) fn next_heartbeat(self) -> Option<Instant> {
         match self {
-            Self::Registered { next_heartbeat } => Some(next_heartbeat),
+            Self::Registered(pulse) => Some(pulse.due()),
             Self::Offline | Self::Greeting | Self::Refused | Self::Finished => None,
         }
     }
@@ -59,7 +57,7 @@ pub(super) struct Identity {
 impl Ledger {
     pub(super) fn coordinator_connected(&mut self) {
         match self.session {
-            Session::Offline | Session::Greeting | Session::Registered { .. } => {}
+            Session::Offline | Session::Greeting | Session::Registered(_) => {}
             Session::Refused | Session::Finished => return,
         }
         self.session = Session::Greeting;
@@ -70,9 +68,7 @@ impl Ledger {
 
     pub(super) fn coordinator_lost(&mut self) {
         match self.session {
-            Session::Offline | Session::Greeting | Session::Registered { .. } => {
-                self.session = Session::Offline
-            }
+            Session::Offline | Session::Greeting | Session::Registered(_) => self.session = Session::Offline,
             Session::Refused | Session::Finished => {}
         }
         // Results keep coming over the data links; what the coordinator missed is said again after the welcome.
@@ -96,24 +92,27 @@ impl Ledger {
                 }
             }
             CoordinatorToApp::JobFailed { job, failure } => self.given_up(job, failure),
-            CoordinatorToApp::HeartbeatAck { sequence: _ } | CoordinatorToApp::Capability(_) => {}
+            CoordinatorToApp::Stopped { reason } => self.stopped(&reason),
+            CoordinatorToApp::HeartbeatAck { sequence: _ } => {
+                if let Session::Registered(pulse) = &mut self.session {
+                    pulse.answered(now);
+                }
+            }
+            CoordinatorToApp::Capability(_) => {}
         }
     }
 
     pub(super) fn session_timeout(&mut self, now: Instant) {
-        let Session::Registered { next_heartbeat } = self.session else { return };
-        if next_heartbeat > now {
-            return;
-        }
-        self.session = Session::Registered { next_heartbeat: self.heartbeat_after(now) };
+        let Session::Registered(pulse) = &mut self.session else { return };
+        let Some(answers) = pulse.beat(now) else { return };
         self.heartbeat_sequence += 1;
-        let sequence = self.heartbeat_sequence;
-        self.tell_coordinator(AppToCoordinator::Heartbeat { sequence });
+        let (sequence, unanswered) = (self.heartbeat_sequence, answers == Answers::Missing);
+        self.tell_coordinator(AppToCoordinator::Heartbeat { sequence, unanswered });
     }
 
     /// Puts what is to be said to the coordinator into messages.
     pub(super) fn flush_session(&mut self) {
-        if !matches!(self.session, Session::Registered { .. }) {
+        if !matches!(self.session, Session::Registered(_)) {
             return;
         }
         while !self.already_delivered.is_empty() {
@@ -132,7 +131,7 @@ impl Ledger {
         // Acknowledgements first: a worker that gets them keeps no result of ours.
         self.flush_session();
         self.flush_nodes();
-        if matches!(self.session, Session::Registered { .. } | Session::Greeting) {
+        if matches!(self.session, Session::Registered(_) | Session::Greeting) {
             self.tell_coordinator(AppToCoordinator::Goodbye);
         }
         self.session = Session::Finished;
@@ -147,8 +146,7 @@ impl Ledger {
         if self.session != Session::Greeting {
             return;
         }
-        self.liveness = liveness;
-        self.session = Session::Registered { next_heartbeat: self.heartbeat_after(now) };
+        self.session = Session::Registered(Pulse::new(now, liveness));
         let before = self.identity.replace(identity);
         if before.is_some_and(|before| before.app != identity.app) {
             // Attempts of another application id can never be answered: nodes hold them under the old id.
@@ -162,10 +160,6 @@ impl Ledger {
             batch.requested = false;
         }
         self.say_unreachable_again();
-    }
-
-    fn heartbeat_after(&self, now: Instant) -> Instant {
-        now.after(Duration::from_millis(self.liveness.heartbeat_ms.max(1)))
     }
 
     fn request(&mut self, id: BatchId) {

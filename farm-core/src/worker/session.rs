@@ -1,12 +1,11 @@
 //! The worker's talk with the coordinator: registration, heartbeats, orders. Losing it stops nothing: running, queueing
 //! and delivering go on.
 
-use std::time::Duration;
-
 use super::{Effect, WorkerMachine, drain::Drain};
 use crate::{
     id::JobAttempt,
-    message::{CoordinatorToNode, Liveness, NodeHello, NodeToCoordinator, PROTOCOL_VERSION},
+    message::{CoordinatorToNode, NodeHello, NodeToCoordinator, PROTOCOL_VERSION},
+    pulse::{Answers, Pulse},
     time::Instant,
 };
 
@@ -18,25 +17,20 @@ pub(super) enum Session {
     /// Hello said, no welcome yet.
     Greeting,
     /// Welcome.
-    Registered {
-        /// Timings to keep.
-        liveness: Liveness,
-        /// When to say that we are alive.
-        next_heartbeat: Instant,
-    },
+    Registered(Pulse),
 }
 
 impl Session {
     /// The timer of this state.
-    pub(super) const fn next_heartbeat(self) -> Option<Instant> {
+    pub(super) fn next_heartbeat(self) -> Option<Instant> {
         match self {
-            Self::Registered { next_heartbeat, .. } => Some(next_heartbeat),
+            Self::Registered(pulse) => Some(pulse.due()),
             Self::Offline | Self::Greeting => None,
         }
     }
 
     pub(super) const fn is_registered(self) -> bool {
-        matches!(self, Self::Registered { .. })
+        matches!(self, Self::Registered(_))
     }
 }
 
@@ -73,8 +67,7 @@ impl WorkerMachine {
                     return;
                 }
                 self.node = Some(node);
-                self.session =
-                    Session::Registered { liveness, next_heartbeat: next_heartbeat(now, &liveness) };
+                self.session = Session::Registered(Pulse::new(now, liveness));
                 self.reports.unsend();
                 self.await_announcements(now);
                 self.tell_lost_devices();
@@ -88,20 +81,23 @@ impl WorkerMachine {
             CoordinatorToNode::Located { content, peer } => self.located(content, peer),
             CoordinatorToNode::Evict { contents } => self.push(Effect::Evict(contents)),
             CoordinatorToNode::Drain => self.start_drain(now),
-            CoordinatorToNode::HeartbeatAck { sequence } => self.reports.confirm(sequence),
+            CoordinatorToNode::HeartbeatAck { sequence } => {
+                self.reports.confirm(sequence);
+                if let Session::Registered(pulse) = &mut self.session {
+                    pulse.answered(now);
+                }
+            }
         }
     }
 
     pub(super) fn session_timeout(&mut self, now: Instant) {
-        let Session::Registered { liveness, next_heartbeat: due } = self.session else { return };
-        if due > now {
-            return;
-        }
-        self.session = Session::Registered { liveness, next_heartbeat: next_heartbeat(now, &liveness) };
+        let Session::Registered(pulse) = &mut self.session else { return };
+        let Some(answers) = pulse.beat(now) else { return };
         self.heartbeat_sequence += 1;
         let devices = self.loads(now);
         self.tell_coordinator(NodeToCoordinator::Heartbeat {
             sequence: self.heartbeat_sequence,
+            unanswered: answers == Answers::Missing,
             devices,
             spool_bytes: self.spool_bytes,
             cache: Some(self.cache),
@@ -125,8 +121,4 @@ impl WorkerMachine {
         self.drain = Drain::Gone;
         self.push(Effect::Exit);
     }
-}
-
-fn next_heartbeat(now: Instant, liveness: &Liveness) -> Instant {
-    now.after(Duration::from_millis(liveness.heartbeat_ms.max(1)))
 }

@@ -31,6 +31,8 @@ pub(crate) struct Farm {
     batches: u64,
     pub(crate) questions: Vec<(QuestionId, String, Question)>,
     pub(crate) refused: Option<String>,
+    /// Why the application was stopped, each time that it was told.
+    pub(crate) stopped: Vec<String>,
     /// Whether the last plan was of second attempts.
     pub(crate) speculative: bool,
     /// By node, in order.
@@ -52,6 +54,7 @@ impl Farm {
             batches: 0,
             questions: Vec::new(),
             refused: None,
+            stopped: Vec::new(),
             speculative: false,
             cancelled: Vec::new(),
             located: Vec::new(),
@@ -121,6 +124,9 @@ impl Farm {
                 Effect::ToApp { message: CoordinatorToApp::Refused { reason }, .. } => {
                     self.refused = Some(reason);
                 }
+                Effect::ToApp { message: CoordinatorToApp::Stopped { reason }, .. } => {
+                    self.stopped.push(reason);
+                }
                 Effect::ToNode { link, message: CoordinatorToNode::Cancel { jobs } } => {
                     self.cancelled.extend(jobs.into_iter().map(|job| (link.0, job)));
                 }
@@ -157,6 +163,21 @@ impl Farm {
         self.say(AppToCoordinator::Plan(request))
     }
 
+    /// A node or the application says whether its heartbeats are answered; 0 is the application.
+    pub(crate) fn says_unanswered(&mut self, who: u64, unanswered: bool) -> BTreeMap<u64, Vec<JobAttempt>> {
+        if who == APP.0 {
+            return self.say(AppToCoordinator::Heartbeat { sequence: 2, unanswered });
+        }
+        let message = NodeToCoordinator::Heartbeat {
+            sequence: 2,
+            unanswered,
+            devices: Vec::new(),
+            spool_bytes: 0,
+            cache: None,
+        };
+        self.handle(Event::FromNode { link: LinkId(who), message })
+    }
+
     /// A node says that it lives, and what its device has run for how many nanoseconds.
     pub(crate) fn heartbeat(
         &mut self,
@@ -167,6 +188,7 @@ impl Farm {
         let devices = vec![DeviceLoad { queued_jobs: 0, running }];
         let message = NodeToCoordinator::Heartbeat {
             sequence: 1,
+            unanswered: false,
             devices,
             spool_bytes: 0,
             cache: Some(CacheFigures::default()),
@@ -189,7 +211,17 @@ impl Farm {
         job: JobAttempt,
         failure: JobFailure,
     ) -> BTreeMap<u64, Vec<JobAttempt>> {
-        self.report(node, job, 0, Some(failure))
+        self.failed_on(node, DeviceIndex(0), job, failure)
+    }
+
+    pub(crate) fn failed_on(
+        &mut self,
+        node: u64,
+        device: DeviceIndex,
+        job: JobAttempt,
+        failure: JobFailure,
+    ) -> BTreeMap<u64, Vec<JobAttempt>> {
+        self.report(node, device, job, 0, Some(failure))
     }
 
     pub(crate) fn open_jobs(&self) -> u64 {
@@ -218,7 +250,7 @@ impl Farm {
 
     fn advance_to(&mut self, due: Instant) -> BTreeMap<u64, Vec<JobAttempt>> {
         self.now = self.now.max(due);
-        self.say(AppToCoordinator::Heartbeat { sequence: 1 });
+        self.say(AppToCoordinator::Heartbeat { sequence: 1, unanswered: false });
         let connected = self.machine.status().nodes;
         for node in connected.iter().filter(|node| node.state == NodeState::Alive) {
             let link: u64 = node.name.trim_start_matches("node ").parse().unwrap();
@@ -231,20 +263,28 @@ impl Farm {
     fn report(
         &mut self,
         node: u64,
+        device: DeviceIndex,
         job: JobAttempt,
         device_time_ns: u64,
         failure: Option<JobFailure>,
     ) -> BTreeMap<u64, Vec<JobAttempt>> {
         let delivered = if failure.is_none() { vec![job] } else { Vec::new() };
-        let (device, trace) = (DeviceIndex(0), JobTrace::default());
+        let trace = JobTrace::default();
         let executed = vec![Executed { job, device, device_time_ns, trace, failure }];
         let message = NodeToCoordinator::Report { sent_at: self.now, executed, delivered };
         self.handle(Event::FromNode { link: LinkId(node), message })
     }
 
+    /// A node says that it has nothing to report.
+    pub(crate) fn ended_nothing(&mut self, node: u64) {
+        let message =
+            NodeToCoordinator::Report { sent_at: self.now, executed: Vec::new(), delivered: Vec::new() };
+        self.handle(Event::FromNode { link: LinkId(node), message });
+    }
+
     /// A node has executed and delivered a job just now, in so many milliseconds.
     pub(crate) fn ended(&mut self, node: u64, job: JobAttempt, took_ms: u64) {
-        self.report(node, job, took_ms * MILLISECOND_NS, None);
+        self.report(node, DeviceIndex(0), job, took_ms * MILLISECOND_NS, None);
     }
 
     /// A node has executed and delivered jobs, each in the time that `took_ms` says.
@@ -252,7 +292,7 @@ impl Farm {
         for &job in jobs {
             let device_time_ns = took_ms(job) * MILLISECOND_NS;
             self.now = self.now.after(Duration::from_nanos(device_time_ns));
-            self.report(node, job, device_time_ns, None);
+            self.report(node, DeviceIndex(0), job, device_time_ns, None);
         }
     }
 }

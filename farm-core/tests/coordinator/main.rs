@@ -2,8 +2,10 @@
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on panics")]
 
+mod breaker;
 mod farm;
 mod guard;
+mod hearing;
 mod losses;
 mod policies;
 mod speculation;

@@ -152,7 +152,7 @@ pub struct AttemptRun {
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct JobFailure {
     /// The cause.
-    #[prost(oneof = "job_failure::Cause", tags = "1, 2, 3, 4, 5, 6, 7, 8")]
+    #[prost(oneof = "job_failure::Cause", tags = "1, 2, 3, 4, 5, 6, 7, 8, 9")]
     pub cause: ::core::option::Option<job_failure::Cause>,
 }
 /// Nested message and enum types in `JobFailure`.
@@ -184,6 +184,9 @@ pub mod job_failure {
         /// The node gave the job back unexecuted; nobody is to blame.
         #[prost(message, tag = "8")]
         Returned(super::Nothing),
+        /// Too many attempts of the application's jobs in a row ended with their devices: the last one's words.
+        #[prost(string, tag = "9")]
+        PoisonApplication(::prost::alloc::string::String),
     }
 }
 /// A case that says all by being there.
@@ -1297,12 +1300,15 @@ pub struct AppHeartbeat {
     /// Echoed in the answer.
     #[prost(uint64, tag = "1")]
     pub sequence: u64,
+    /// No answer came for as long as makes suspect: nothing gets through from there to here.
+    #[prost(bool, tag = "2")]
+    pub unanswered: bool,
 }
 /// Coordinator to application.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct CoordinatorToApp {
     /// One of these.
-    #[prost(oneof = "coordinator_to_app::Message", tags = "1, 2, 3, 4, 5, 6, 7")]
+    #[prost(oneof = "coordinator_to_app::Message", tags = "1, 2, 3, 4, 5, 6, 7, 8")]
     pub message: ::core::option::Option<coordinator_to_app::Message>,
 }
 /// Nested message and enum types in `CoordinatorToApp`.
@@ -1331,6 +1337,9 @@ pub mod coordinator_to_app {
         /// What to show to nodes from now on: a Capability, encoded. In a secured farm, before the welcome and from time to time.
         #[prost(bytes, tag = "7")]
         Capability(::prost::alloc::vec::Vec<u8>),
+        /// The coordinator gave all jobs up, and plans none for a while.
+        #[prost(message, tag = "8")]
+        Stopped(super::Stopped),
     }
 }
 /// Registered.
@@ -1397,6 +1406,13 @@ pub struct Waiting {
     /// Why.
     #[prost(enumeration = "WaitReason", tag = "2")]
     pub reason: i32,
+}
+/// The coordinator gave all jobs up.
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct Stopped {
+    /// Why, for people.
+    #[prost(string, tag = "1")]
+    pub reason: ::prost::alloc::string::String,
 }
 /// The coordinator gave a job up.
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
@@ -1814,6 +1830,9 @@ pub struct NodeHeartbeat {
     /// How the node's cache of contents stands.
     #[prost(message, optional, tag = "4")]
     pub cache: ::core::option::Option<CacheFigures>,
+    /// No answer came for as long as makes suspect: nothing gets through from there to here.
+    #[prost(bool, tag = "5")]
+    pub unanswered: bool,
 }
 /// How one device stands.
 #[derive(Clone, PartialEq, ::prost::Message)]

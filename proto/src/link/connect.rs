@@ -35,9 +35,9 @@ const ADDRESSES_PER_NAME: usize = 8;
 /// Handshakes that wait to be accepted.
 const MAX_INCOMING: usize = 256;
 /// Either side sends something at least this often.
-const KEEP_ALIVE: Duration = Duration::from_secs(2);
-/// A link whose peer is silent for this long is lost.
-const IDLE_TIMEOUT_MS: u32 = 10_000;
+const KEEP_ALIVE: Duration = Duration::from_secs(1);
+/// A link whose peer is silent for this long after it was last spoken to is lost: 6 s after its last word at most.
+const IDLE_TIMEOUT_MS: u32 = 5_000;
 /// Unread bytes of one stream, at most.
 const STREAM_WINDOW_BYTES: u32 = 16 << 20;
 /// Unread bytes of one link, at most.

@@ -12,7 +12,7 @@ use farm_core::{
     time::Instant,
 };
 use tests::sim::{
-    faults::{Fault, KEEPALIVE},
+    faults::{Fault, keepalive},
     network::Proc,
     world::{Happening, Setup, World},
 };
@@ -68,8 +68,9 @@ pub(super) fn after(world: &mut World, wait: Duration, fault: Fault) {
 pub(super) fn part(world: &mut World, one: Proc, other: Proc, duration: Duration) {
     world.fault(Fault::Partition { from: one, to: other, duration });
     world.fault(Fault::Partition { from: other, to: one, duration });
-    if duration > KEEPALIVE {
-        after(world, KEEPALIVE, Fault::TimeOut { one, other });
+    let patience = keepalive(one, other);
+    if duration > patience {
+        after(world, patience, Fault::TimeOut { one, other });
     }
 }
 

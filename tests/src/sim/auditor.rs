@@ -32,6 +32,9 @@ const INTERRUPTED_LAG: f64 = 1.0;
 /// many events more, so that the work per event stays the same.
 const JOBS_PER_CHECK: usize = 32;
 
+/// Fewest crashes in a row for which an application is stopped.
+const STOPPING_CRASHES: u32 = 8;
+
 /// Checks that something was there to be judged: a run in which an invariant was never looked at proves nothing of it.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Checks {
@@ -127,6 +130,8 @@ pub struct Auditor {
     over: usize,
     /// Which application each id was given to.
     names: BTreeMap<AppId, usize>,
+    /// Executions of each application's jobs that ended so.
+    crashes: BTreeMap<AppId, u32>,
     /// What went wrong, by whom it can have cost an execution: a process, or an application and a worker.
     disturbances: BTreeMap<(Proc, Proc), u32>,
     last_disturbance: Option<Instant>,
@@ -283,6 +288,7 @@ impl Auditor {
         let record = self.jobs.entry(job).or_default();
         record.crashes += 1;
         let crashes = record.crashes;
+        *self.crashes.entry(job.app).or_default() += 1;
         // Crashes are soft state: a new coordinator, or one that forgot the application, counts anew; a report can get
         // lost with whatever else goes wrong.
         let counts = 1 + self.count(Proc::Coordinator) + self.app_of(job).map_or(0, |app| self.count(app));
@@ -304,6 +310,10 @@ impl Auditor {
             let suspicions = crashes + self.disturbances_of(job);
             assert!(suspicions >= max_crashes, "I10: {job} is no poison: {reason}");
         }
+        if let Ending::Failed(JobFailure::PoisonApplication(reason)) = ending {
+            let crashes = self.crashes(job.app);
+            assert!(crashes >= STOPPING_CRASHES, "I10: {} is no poison: {reason}", job.app);
+        }
     }
 
     /// How a worker's applications stand with its fair share (I7).
@@ -323,6 +333,12 @@ impl Auditor {
         } else if worst <= 1.0 {
             self.fair.insert(worker);
         }
+    }
+
+    /// Executions of an application's jobs that ended with a failure that is the job's own.
+    #[must_use]
+    pub fn crashes(&self, app: AppId) -> u32 {
+        self.crashes.get(&app).copied().unwrap_or(0)
     }
 
     /// Executions of each job.

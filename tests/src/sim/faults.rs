@@ -13,9 +13,15 @@ use super::{
     world::{Happening, World},
 };
 
-/// How long a dead connection stands: HTTP/2 pings every 5 s wait 5 s for their answer, QUIC's idle time is 10 s
-/// (`proto/src/control/transport.rs`, `proto/src/link/connect.rs`).
-pub const KEEPALIVE: Duration = Duration::from_secs(10);
+/// How long a dead connection stands: HTTP/2 pings every 5 s wait 5 s for their answer, QUIC's idle time is 5 s from the last
+/// ping, one every second (`proto/src/control/transport.rs`, `proto/src/link/connect.rs`).
+#[must_use]
+pub const fn keepalive(one: Proc, other: Proc) -> Duration {
+    match (one, other) {
+        (Proc::Coordinator, _) | (_, Proc::Coordinator) => Duration::from_secs(10),
+        (Proc::Worker(_) | Proc::App(_), Proc::Worker(_) | Proc::App(_)) => Duration::from_secs(6),
+    }
+}
 
 /// One thing that goes wrong, or comes right.
 #[derive(Clone, Debug)]
@@ -208,8 +214,8 @@ impl World {
                 self.after(restart, Happening::Fault(Fault::Start { worker }));
             }
             Fault::PowerOff { worker } => {
-                for link in self.power_off(worker) {
-                    self.after(KEEPALIVE, Happening::Fault(Fault::Break(link)));
+                for (link, patience) in self.power_off(worker) {
+                    self.after(patience, Happening::Fault(Fault::Break(link)));
                 }
             }
             Fault::Start { worker } => self.start_worker(worker),

@@ -17,6 +17,7 @@ use rand::Rng;
 
 use super::{
     auditor::worker_at,
+    faults::keepalive,
     world::{Happening, World},
 };
 
@@ -370,6 +371,11 @@ impl World {
 
     pub(super) fn links_between(&self, dialler: Proc, listener: Proc) -> Vec<LinkId> {
         self.links.iter().filter(|(_, link)| link.ends() == [dialler, listener]).map(|(&id, _)| id).collect()
+    }
+
+    /// How long a connection stands that is dead.
+    pub(super) fn keepalive_of(&self, id: LinkId) -> Duration {
+        self.links.get(&id).map_or(Duration::ZERO, |link| keepalive(link.dialler, link.listener))
     }
 
     pub(super) fn any_link(&mut self) -> Option<LinkId> {

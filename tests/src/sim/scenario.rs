@@ -235,7 +235,7 @@ fn assert_endings(world: &World) {
                 Ending::Delivered(_) => !poison,
                 Ending::Failed(JobFailure::Cancelled) => host.cancelled.contains(task),
                 // Whether it was one, the auditor asked.
-                Ending::Failed(JobFailure::Poison(_)) => true,
+                Ending::Failed(JobFailure::Poison(_) | JobFailure::PoisonApplication(_)) => true,
                 Ending::Failed(_) => false,
             };
             assert!(fits, "I2: {task} {index} ended with {ending:?}");

@@ -26,7 +26,9 @@ impl From<AppToCoordinator> for v1::AppToCoordinator {
                 Message::Unreachable(v1::Unreachable { node: node.0, session: session.0 })
             }
             AppToCoordinator::Cancel(task) => Message::Cancel(v1::CancelTask { task: task.0 }),
-            AppToCoordinator::Heartbeat { sequence } => Message::Heartbeat(v1::AppHeartbeat { sequence }),
+            AppToCoordinator::Heartbeat { sequence, unanswered } => {
+                Message::Heartbeat(v1::AppHeartbeat { sequence, unanswered })
+            }
             AppToCoordinator::Goodbye => Message::Goodbye(v1::Nothing {}),
         };
         Self { message: Some(message) }
@@ -46,7 +48,9 @@ impl TryFrom<v1::AppToCoordinator> for AppToCoordinator {
                 Self::Unreachable { node: NodeId(node), session: NodeSession(session) }
             }
             Message::Cancel(v1::CancelTask { task }) => Self::Cancel(TaskId(task)),
-            Message::Heartbeat(v1::AppHeartbeat { sequence }) => Self::Heartbeat { sequence },
+            Message::Heartbeat(v1::AppHeartbeat { sequence, unanswered }) => {
+                Self::Heartbeat { sequence, unanswered }
+            }
             Message::Goodbye(v1::Nothing {}) => Self::Goodbye,
         })
     }
@@ -163,6 +167,7 @@ impl From<CoordinatorToApp> for v1::CoordinatorToApp {
             CoordinatorToApp::JobFailed { job, failure } => {
                 Message::JobFailed(v1::JobFailed { job: Some(job.into()), failure: Some(failure.into()) })
             }
+            CoordinatorToApp::Stopped { reason } => Message::Stopped(v1::Stopped { reason: cut(reason) }),
             CoordinatorToApp::HeartbeatAck { sequence } => {
                 Message::HeartbeatAck(v1::HeartbeatAck { sequence })
             }
@@ -193,6 +198,7 @@ impl TryFrom<v1::CoordinatorToApp> for CoordinatorToApp {
                 job: required("JobFailed.job", failed.job)?.into(),
                 failure: required("JobFailed.failure", failed.failure)?.try_into()?,
             },
+            Message::Stopped(stopped) => Self::Stopped { reason: text("Stopped.reason", stopped.reason)? },
             Message::HeartbeatAck(v1::HeartbeatAck { sequence }) => Self::HeartbeatAck { sequence },
             Message::Capability(bytes) => {
                 within("CoordinatorToApp.capability", bytes.len(), MAX_CAPABILITY_BYTES)?;

@@ -192,6 +192,7 @@ impl From<JobFailure> for v1::JobFailure {
             JobFailure::OutOfMemory(reason) => Cause::OutOfMemory(cut(reason)),
             JobFailure::ContentUnavailable(hash) => Cause::ContentUnavailable(hash.0.to_vec()),
             JobFailure::Poison(reason) => Cause::Poison(cut(reason)),
+            JobFailure::PoisonApplication(reason) => Cause::PoisonApplication(cut(reason)),
             JobFailure::Cancelled => Cause::Cancelled(v1::Nothing {}),
             JobFailure::Returned => Cause::Returned(v1::Nothing {}),
         };
@@ -215,6 +216,9 @@ impl TryFrom<v1::JobFailure> for JobFailure {
                 Self::ContentUnavailable(content_hash("JobFailure.content_unavailable", &hash)?)
             }
             Cause::Poison(reason) => Self::Poison(text("JobFailure.poison", reason)?),
+            Cause::PoisonApplication(reason) => {
+                Self::PoisonApplication(text("JobFailure.poison_application", reason)?)
+            }
             Cause::Cancelled(v1::Nothing {}) => Self::Cancelled,
             Cause::Returned(v1::Nothing {}) => Self::Returned,
         })

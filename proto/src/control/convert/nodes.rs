@@ -21,10 +21,10 @@ impl From<NodeToCoordinator> for v1::NodeToCoordinator {
         use v1::node_to_coordinator::Message;
         let message = match message {
             NodeToCoordinator::Hello(hello) => Message::Hello(hello.into()),
-            NodeToCoordinator::Heartbeat { sequence, devices, spool_bytes, cache } => {
+            NodeToCoordinator::Heartbeat { sequence, unanswered, devices, spool_bytes, cache } => {
                 let devices = devices.into_iter().map(Into::into).collect();
                 let cache = cache.map(Into::into);
-                Message::Heartbeat(v1::NodeHeartbeat { sequence, devices, spool_bytes, cache })
+                Message::Heartbeat(v1::NodeHeartbeat { sequence, unanswered, devices, spool_bytes, cache })
             }
             NodeToCoordinator::Report { sent_at, executed, delivered } => {
                 Message::Report(report(sent_at, executed, &delivered))
@@ -63,6 +63,7 @@ impl TryFrom<v1::NodeToCoordinator> for NodeToCoordinator {
                 within("NodeHeartbeat.devices", heartbeat.devices.len(), MAX_ENTRIES)?;
                 Self::Heartbeat {
                     sequence: heartbeat.sequence,
+                    unanswered: heartbeat.unanswered,
                     devices: heartbeat
                         .devices
                         .into_iter()

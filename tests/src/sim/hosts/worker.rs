@@ -361,8 +361,8 @@ impl World {
         self.end_process(index);
     }
 
-    /// The process is gone, its connections silent. Gives them.
-    pub(in crate::sim) fn power_off(&mut self, index: usize) -> Vec<LinkId> {
+    /// The process is gone, its connections silent. Gives them, and when their keepalives notice.
+    pub(in crate::sim) fn power_off(&mut self, index: usize) -> Vec<(LinkId, Duration)> {
         if !self.workers[index].is_up() {
             return Vec::new();
         }
@@ -370,7 +370,7 @@ impl World {
         let links = self.links_of(Proc::Worker(index));
         links.iter().for_each(|&link| self.silence_link(link));
         self.end_process(index);
-        links
+        links.into_iter().map(|link| (link, self.keepalive_of(link))).collect()
     }
 
     fn end_process(&mut self, index: usize) {
