@@ -15,7 +15,7 @@ use proto::{
     },
     trust::{
         Authority, Capability, IDENTITY_LIFETIME, Identity, Member, Membership, Principal, Role,
-        SECRET_BYTES, check_name, unix_seconds,
+        SECRET_BYTES, check_name, unix_now,
     },
 };
 use serde_json::json;
@@ -225,7 +225,7 @@ impl Security {
     fn join(&self, request: &v1::JoinRequest, address: &str) -> Result<Membership, StoreError> {
         let issue =
             |role, name: &str| self.authority.admit(role, name, &request.request_der, IDENTITY_LIFETIME);
-        let joined = self.store.join(&request.secret, &request.name, unix_seconds(SystemTime::now()), issue);
+        let joined = self.store.join(&request.secret, &request.name, unix_now(), issue);
         match &joined {
             Ok(membership) => {
                 let who = Member::of_certificate(&membership.certificate_der)?.principal;
@@ -280,7 +280,7 @@ impl Trust for TrustService {
         let authority = security.authority.fingerprint().to_vec();
         let id = on_disk(move || {
             let (role, name, uses) = (token.role.clone(), token.name.clone(), token.uses_left);
-            let id = security.store.add_token(&secret, token, unix_seconds(SystemTime::now()))?;
+            let id = security.store.add_token(&secret, token, unix_now())?;
             let details = json!({ "id": id, "role": role, "name": name, "uses": uses });
             security.audit.done("token created", &operator.principal.to_string(), details);
             Ok(id)
@@ -294,7 +294,7 @@ impl Trust for TrustService {
         request: Request<v1::ListTokensRequest>,
     ) -> Result<Response<v1::ListTokensResponse>, Status> {
         let (security, _) = self.operator(&request)?;
-        let tokens = on_disk(move || security.store.tokens(unix_seconds(SystemTime::now()))).await?;
+        let tokens = on_disk(move || security.store.tokens(unix_now())).await?;
         let tokens = tokens.into_iter().map(|token| v1::TokenStatus {
             id: token.id,
             role: token.role,
@@ -419,7 +419,7 @@ fn token(asked: &v1::CreateTokenRequest, maker: &Principal) -> Result<Token, Sta
         id: 0,
         role: role.to_string(),
         name: asked.name.clone(),
-        expires_s: unix_seconds(SystemTime::now()) + asked.lifetime_s,
+        expires_s: unix_now() + asked.lifetime_s,
         uses_left: asked.uses,
         maker: maker.to_string(),
     })

@@ -4,13 +4,13 @@ use std::{
     fs,
     io::{self, Write as _},
     path::Path,
-    time::{Duration, SystemTime},
+    time::Duration,
 };
 
 use anyhow::{Context as _, anyhow};
 use proto::{
     control::{self, Invitation, v1::TokenStatus},
-    trust::{Identity, JoinToken, Role, check_name, unix_seconds},
+    trust::{Identity, JoinToken, Role, check_name, unix_now},
 };
 use serde_json::{Value, json};
 
@@ -157,7 +157,7 @@ pub(crate) async fn token(verb: &TokenVerb, target: &Target<'_>, format: Format)
                 "token": token.to_string(),
                 "role": role.to_string(),
                 "name": name,
-                "expires_s": unix_seconds(SystemTime::now()) + expires.as_secs(),
+                "expires_s": unix_now() + expires.as_secs(),
                 "uses": uses,
             });
             // The token alone: scripts take it as it is.
@@ -192,8 +192,7 @@ fn tokens_table(tokens: &[Value]) -> String {
     let text = |value: &Value| value.as_str().map_or_else(String::new, printable);
     let mut table = output::table(["TOKEN", "ROLE", "NAME", "EXPIRES IN", "USES LEFT", "MADE BY"]);
     for token in tokens {
-        let seconds =
-            token["expires_s"].as_u64().unwrap_or(0).saturating_sub(unix_seconds(SystemTime::now()));
+        let seconds = token["expires_s"].as_u64().unwrap_or(0).saturating_sub(unix_now());
         let minutes = Duration::from_secs(seconds).as_secs().div_ceil(60);
         table.add_row([
             token["id"].to_string(),

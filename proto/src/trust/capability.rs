@@ -114,7 +114,7 @@ mod tests {
             incarnation: AppIncarnation(2),
             holder: holder.principal().clone(),
             epoch: Epoch(3),
-            expires: SystemTime::UNIX_EPOCH + Duration::from_secs(unix_seconds(SystemTime::now()) + 60),
+            expires: SystemTime::UNIX_EPOCH + Duration::from_secs(crate::trust::unix_now() + 60),
         }
     }
 

@@ -22,7 +22,7 @@ use x509_parser::{certificate::X509Certificate, prelude::FromDer as _};
 use super::{
     Member, Principal, TrustError,
     authority::{pem_certificate, private_key_block},
-    read_text, unix_seconds, verify, write_secret,
+    read_text, unix_now, verify, write_secret,
 };
 
 /// What an authority gives to who joins.
@@ -174,7 +174,7 @@ impl Identity {
     #[must_use]
     pub fn is_over(&self) -> bool {
         let current = self.0.current.read().unwrap_or_else(PoisonError::into_inner);
-        current.not_after <= unix_seconds(SystemTime::now())
+        current.not_after <= unix_now()
     }
 
     /// A signing request for a renewal, DER.
@@ -227,7 +227,7 @@ impl Current {
             (seconds(validity.not_before.timestamp()), seconds(validity.not_after.timestamp()))
         };
         // Of its own time: one that is over says so when it is used, and is told from one that never was.
-        let at = unix_seconds(SystemTime::now()).clamp(not_before, not_after.max(not_before));
+        let at = unix_now().clamp(not_before, not_after.max(not_before));
         verify::signed_by(&certificate, authority, SystemTime::UNIX_EPOCH + Duration::from_secs(at))
             .map_err(|error| wrong(&error))?;
         let private = PrivateKeyDer::try_from(key.serialize_der()).map_err(|error| wrong(&error))?;

@@ -82,8 +82,14 @@ pub fn random<const BYTES: usize>() -> Result<[u8; BYTES], TrustError> {
 
 /// Seconds since 1970, as certificates, capabilities and logs count; before 1970 it is 1970.
 #[must_use]
-pub fn unix_seconds(time: SystemTime) -> u64 {
+pub(crate) fn unix_seconds(time: SystemTime) -> u64 {
     time.duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default().as_secs()
+}
+
+/// The same of now.
+#[must_use]
+pub fn unix_now() -> u64 {
+    unix_seconds(SystemTime::now())
 }
 
 /// Reads a small text file.
