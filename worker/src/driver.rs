@@ -6,7 +6,7 @@ use std::{
     io,
     pin::Pin,
     sync::Arc,
-    time::{Duration, Instant, SystemTime},
+    time::{Duration, SystemTime},
 };
 
 use bytes::Bytes;
@@ -26,6 +26,7 @@ use proto::{
 use tokio::{
     sync::{mpsc, oneshot},
     task::JoinSet,
+    time::Instant,
 };
 
 use crate::{
@@ -153,7 +154,7 @@ pub(crate) async fn drive(setup: Setup) -> End {
         tokio::select! {
             _ = received.recv_many(&mut taken, INPUTS_PER_TURN) => {}
             _ = events.recv_many(&mut heard, INPUTS_PER_TURN) => {}
-            () = tokio::time::sleep_until(wake.unwrap_or_else(Instant::now).into()), if wake.is_some() => {}
+            () = tokio::time::sleep_until(wake.unwrap_or_else(Instant::now)), if wake.is_some() => {}
         }
         for input in taken.drain(..) {
             driver.take(input);
