@@ -63,12 +63,14 @@ const RESTRICTED: [(&str, &[&str]); 13] = [
     ("redb", &["coordinator"]),
 ];
 
-/// What tests of a crate may name besides: devices to run kernels on, naga to check layouts, a farm to link against.
-const ALSO_IN_TESTS: [(&str, &[&str]); 4] = [
+/// What tests of a crate may name besides: devices to run kernels on, naga to check layouts, a farm to link against, what a
+/// simulated network stands in for.
+const ALSO_IN_TESTS: [(&str, &[&str]); 5] = [
     ("bdpt-kernel", &["gpu-exec", "naga"]),
     ("mi-kernel", &["gpu-exec", "naga"]),
     ("client-sdk", &["coordinator", "worker", "gpu-exec"]),
     ("worker", &["coordinator", "client-sdk"]),
+    ("tests", &["quinn", "tokio"]),
 ];
 
 /// Everything the pure core may name outside its tests.

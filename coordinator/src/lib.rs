@@ -26,10 +26,9 @@ use farm_core::{
     id::NodeId,
     message::Liveness,
 };
-use proto::control::Incoming;
+use proto::{control::Incoming, net::TcpListener};
 use thiserror::Error;
 use tokio::{
-    net::TcpListener,
     sync::{oneshot, watch},
     task::{JoinHandle, JoinSet},
 };

@@ -31,5 +31,6 @@ pub use self::{
     error::{Busy, OpenError},
     executor::{Executor, ExecutorConfig, ExecutorEvent, Host, HungDevice, Order, expand},
     real::{Adapter, enumerate},
+    sim::{SimClock, SimulatedTime, simulate_time},
     spec::{DeviceSpec, SimSpec, SpecError},
 };

@@ -21,6 +21,7 @@ use farm_core::{
     program::{Buffer, Command, JobProgram, ProgramQuota, validate},
 };
 
+pub use self::timer::{SimClock, SimulatedTime, simulate_time};
 use crate::{
     error::{Busy, OpenError},
     executor::{DEPTH, ExecutorEvent, Host, Order},
@@ -186,7 +187,7 @@ impl Shared {
             class,
             program,
             sections: summary.sections,
-            since: Instant::now(),
+            since: timer::now(),
             done: Duration::ZERO,
             until: duration,
             duration,
@@ -201,7 +202,7 @@ impl Shared {
 
     /// Lets a job run from now on.
     fn run(self: &Arc<Self>, state: &mut State, running: Running) {
-        let running = Running { since: Instant::now(), ..running };
+        let running = Running { since: timer::now(), ..running };
         self.wake_for(state, &running);
         state.running = Some(running);
         self.yield_soon(state);
@@ -243,7 +244,7 @@ impl Shared {
 
 impl Running {
     fn device_time(&self) -> Duration {
-        (self.done + self.since.elapsed()).min(self.until)
+        (self.done + timer::now().saturating_duration_since(self.since)).min(self.until)
     }
 }
 

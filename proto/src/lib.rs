@@ -6,5 +6,6 @@
 pub mod codec;
 pub mod control;
 pub mod link;
+pub mod net;
 pub mod tls;
 pub mod trust;

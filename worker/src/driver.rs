@@ -5,7 +5,7 @@ use std::{
     collections::HashMap,
     io,
     sync::Arc,
-    time::{Duration, Instant, SystemTime},
+    time::{Duration, SystemTime},
 };
 
 use farm_core::{
@@ -24,6 +24,7 @@ use proto::{
 use tokio::{
     sync::{mpsc, oneshot},
     task::JoinSet,
+    time::Instant,
 };
 
 use crate::{
@@ -160,7 +161,7 @@ pub(crate) async fn drive(setup: Setup) -> End {
         tokio::select! {
             _ = received.recv_many(&mut taken, INPUTS_PER_TURN) => {}
             _ = events.recv_many(&mut heard, INPUTS_PER_TURN) => {}
-            () = tokio::time::sleep_until(wake.unwrap_or_else(Instant::now).into()), if wake.is_some() => {}
+            () = tokio::time::sleep_until(wake.unwrap_or_else(Instant::now)), if wake.is_some() => {}
         }
         for input in taken.drain(..) {
             driver.take(input);

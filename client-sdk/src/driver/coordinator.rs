@@ -1,7 +1,7 @@
 //! The connection to the coordinator: one session at a time, and tries with back-off for a bounded time when it is lost.
 //! It never looks into messages.
 
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use bytes::Bytes;
 use farm_core::message::AppToCoordinator;
@@ -9,7 +9,7 @@ use proto::{
     control::{SessionError, SessionReceiver, SessionSender, connect_app},
     trust::Identity,
 };
-use tokio::sync::mpsc;
+use tokio::{sync::mpsc, time::Instant};
 
 use super::{AppSession, CoordinatorToApp, Input};
 

@@ -9,7 +9,7 @@ use std::{
     collections::{HashMap, VecDeque},
     ops::Range,
     sync::mpsc as std_mpsc,
-    time::{Duration, Instant},
+    time::Duration,
 };
 
 use bytes::Bytes;
@@ -27,6 +27,7 @@ use proto::{
 use tokio::{
     sync::{mpsc, oneshot, watch},
     task::JoinSet,
+    time::Instant,
 };
 
 use self::{
@@ -231,7 +232,7 @@ pub(crate) async fn drive(setup: DriverSetup) {
 
 async fn sleep_until(wake: Option<Instant>) {
     if let Some(wake) = wake {
-        tokio::time::sleep_until(wake.into()).await;
+        tokio::time::sleep_until(wake).await;
     }
 }
 

@@ -5,13 +5,14 @@ use std::{
     collections::BTreeMap,
     ops::{Range, RangeInclusive},
     sync::mpsc,
-    time::{Duration, Instant},
+    time::Duration,
 };
 
 use farm_core::{
     id::{BatchId, JobId, TaskId},
     message::{Plan, PlanRequest, WaitReason},
 };
+use tokio::time::Instant;
 
 use crate::{
     error::FarmError,

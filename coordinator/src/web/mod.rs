@@ -13,8 +13,10 @@ use axum::{
     routing::get,
 };
 use farm_core::coordinator::FarmStatus;
-use proto::control::{ControlStream, Incoming};
-use tokio::net::TcpListener;
+use proto::{
+    control::{ControlStream, Incoming},
+    net::TcpListener,
+};
 
 use crate::owner::OwnerHandle;
 

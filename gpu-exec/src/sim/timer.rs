@@ -1,11 +1,14 @@
-//! The one timer thread of all simulated devices of the process.
+//! The time of simulated devices: the one timer thread of all those of the process, or the clock that a test has put in its place.
 //!
-//! It only wakes devices; it knows nothing of jobs. It lives as long as the process, asleep while nothing is due.
+//! It only wakes devices; it knows nothing of jobs. The thread lives as long as the process, asleep while nothing is due.
 
 use std::{
+    cell::RefCell,
     cmp::{Ordering, Reverse},
     collections::BinaryHeap,
     io,
+    marker::PhantomData,
+    rc::Rc,
     sync::{Condvar, LazyLock, Mutex, PoisonError, Weak},
     thread,
     time::Instant,
@@ -37,8 +40,57 @@ pub(super) fn ensure() -> Result<(), io::Error> {
     (*THREAD).map_err(io::Error::from)
 }
 
+/// A clock by which simulated devices take their time.
+pub trait SimClock {
+    /// What time it is.
+    fn now(&self) -> Instant;
+    /// Calls `wake` at a point of time, on a thread that has this clock; never, if the devices are gone by then.
+    fn wake_at(&self, at: Instant, wake: Box<dyn FnOnce() + Send>);
+}
+
+thread_local! {
+    static CLOCK: RefCell<Option<Rc<dyn SimClock>>> = const { RefCell::new(None) };
+}
+
+/// Lets simulated devices go by `clock` on this thread, until what this gives is dropped: in a simulation whose time is not the
+/// system's, all that is done with them is done on one thread.
+///
+/// # Panics
+/// The thread has such a clock already.
+#[must_use = "the system's time is back when this is dropped"]
+pub fn simulate_time(clock: Rc<dyn SimClock>) -> SimulatedTime {
+    let earlier = CLOCK.replace(Some(clock));
+    assert!(earlier.is_none(), "one clock a thread");
+    SimulatedTime { thread: PhantomData }
+}
+
+/// As long as it lives, its thread has a clock for simulated devices.
+#[derive(Debug)]
+pub struct SimulatedTime {
+    thread: PhantomData<Rc<()>>,
+}
+
+impl Drop for SimulatedTime {
+    fn drop(&mut self) {
+        CLOCK.set(None);
+    }
+}
+
+fn clock() -> Option<Rc<dyn SimClock>> {
+    CLOCK.with_borrow(Option::clone)
+}
+
+/// The time of devices on this thread.
+pub(super) fn now() -> Instant {
+    clock().map_or_else(Instant::now, |clock| clock.now())
+}
+
 /// Calls `device` with `generation` at a point of time.
 pub(super) fn wake_at(at: Instant, device: Weak<Shared>, generation: u64) {
+    if let Some(clock) = clock() {
+        let wake = move || device.upgrade().into_iter().for_each(|device| device.alarm(generation));
+        return clock.wake_at(at, Box::new(wake));
+    }
     let mut alarms = TIMER.alarms.lock().unwrap_or_else(PoisonError::into_inner);
     let first = alarms.peek().is_none_or(|Reverse(alarm)| at < alarm.at);
     alarms.push(Reverse(Alarm { at, device, generation }));

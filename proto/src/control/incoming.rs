@@ -10,16 +10,13 @@ use std::{
     time::Duration,
 };
 
-use tokio::{
-    net::{TcpListener, TcpStream},
-    sync::mpsc,
-    time,
-};
+use tokio::{sync::mpsc, time};
 use tokio_rustls::TlsAcceptor;
 use tokio_stream::Stream;
 
 use super::ControlStream;
 use crate::{
+    net::{TcpListener, TcpStream},
     tls::{self, TlsError},
     trust::Identity,
 };
@@ -108,7 +105,7 @@ struct Ear {
 
 impl Ear {
     /// Hands a connection on once there is something to read, and its handshake, if it has one, is through.
-    async fn hear(self, stream: TcpStream, peer: SocketAddr) {
+    async fn hear(self, mut stream: TcpStream, peer: SocketAddr) {
         let mut first = [0];
         let heard = tokio::select! {
             heard = time::timeout(self.patience, stream.peek(&mut first)) => heard,
@@ -120,7 +117,7 @@ impl Ear {
             Err(_) => return tracing::debug!(%peer, "a connection was silent for too long"),
         }
         // A socket without the option is slower, not wrong.
-        let _ = stream.set_nodelay(true);
+        let _ = stream.set_nodelay();
         let stream = match &self.acceptor {
             Some(acceptor) if first == [TLS_HANDSHAKE] => {
                 match time::timeout(self.patience, acceptor.accept(stream)).await {
@@ -139,13 +136,16 @@ impl Ear {
 #[cfg(test)]
 #[allow(clippy::unwrap_used, reason = "a step that fails fails its test")]
 mod tests {
-    use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
+    use tokio::{
+        io::{AsyncReadExt as _, AsyncWriteExt as _},
+        net::TcpStream,
+    };
 
     use super::*;
 
     #[tokio::test]
     async fn silent_connections_are_let_go_and_speaking_ones_keep_their_first_byte() {
-        let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let listener = TcpListener::bind("127.0.0.1:0".parse().unwrap()).await.unwrap();
         let address = listener.local_addr().unwrap();
         let mut incoming = Incoming::patient(listener, None, Duration::from_millis(200));
         let mut silent = TcpStream::connect(address).await.unwrap();

@@ -7,14 +7,11 @@ use std::{
     task::{Context, Poll},
 };
 
-use tokio::{
-    io::{AsyncRead, AsyncWrite, ReadBuf},
-    net::TcpStream,
-};
+use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 use tokio_rustls::server::TlsStream;
 use tonic::transport::server::Connected;
 
-use crate::{tls, trust::Member};
+use crate::{net::TcpStream, tls, trust::Member};
 
 /// Who is at the other end of a connection; in every request's extensions.
 #[derive(Clone, Debug, PartialEq, Eq)]

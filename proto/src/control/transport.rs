@@ -4,11 +4,11 @@ use std::{error::Error, io, sync::Arc, time::Duration};
 
 use hyper_util::rt::TokioIo;
 use rustls::pki_types::ServerName;
-use tokio::net::TcpStream;
 use tokio_rustls::TlsConnector;
 use tonic::transport::{Channel, Endpoint, Server, Uri};
 
 use super::{SessionError, v1};
+use crate::net::TcpStream;
 
 /// How long connecting and each admin request may take.
 pub const ADMIN_TIMEOUT: Duration = Duration::from_secs(5);
@@ -75,16 +75,21 @@ pub(super) async fn connect(
     tls: Option<rustls::ClientConfig>,
 ) -> Result<Channel, SessionError> {
     let endpoint = endpoint(coordinator)?;
+    let address: Arc<str> = coordinator.into();
     let connected = match tls {
-        None => endpoint.connect().await,
+        None => {
+            let dial = move |_: Uri| {
+                let address = Arc::clone(&address);
+                async move { TcpStream::connect(&address).await.map(TokioIo::new) }
+            };
+            endpoint.connect_with_connector(tower::service_fn(dial)).await
+        }
         Some(config) => {
             let connector = TlsConnector::from(Arc::new(config));
-            let address: Arc<str> = coordinator.into();
             let dial = move |_: Uri| {
                 let (connector, address) = (connector.clone(), Arc::clone(&address));
                 async move {
-                    let stream = TcpStream::connect(&*address).await?;
-                    stream.set_nodelay(true)?;
+                    let stream = TcpStream::connect(&address).await?;
                     // Nobody compares it: the certificate's URI and its signature say who it is.
                     let name = ServerName::try_from(COORDINATOR_NAME).map_err(io::Error::other)?;
                     Ok::<_, io::Error>(TokioIo::new(connector.connect(name, stream).await?))
@@ -141,7 +146,6 @@ fn endpoint(coordinator: &str) -> Result<Endpoint, SessionError> {
         Endpoint::from_shared(format!("http://{coordinator}")).map_err(|error| bad(&error.to_string()))?;
     Ok(endpoint
         .connect_timeout(ADMIN_TIMEOUT)
-        .tcp_nodelay(true)
         .http2_keep_alive_interval(KEEP_ALIVE)
         .keep_alive_timeout(KEEP_ALIVE_TIMEOUT)
         .keep_alive_while_idle(true)

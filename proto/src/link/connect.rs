@@ -3,7 +3,7 @@
 use std::{
     collections::BTreeSet,
     io,
-    net::{Ipv4Addr, Ipv6Addr, SocketAddr, UdpSocket},
+    net::{Ipv4Addr, Ipv6Addr, SocketAddr},
     sync::Arc,
     time::Duration,
 };
@@ -13,7 +13,6 @@ use quinn::{
     TokioRuntime, TransportConfig, VarInt,
 };
 use rustls::pki_types::CertificateDer;
-use socket2::{Domain, Protocol, Socket, Type};
 use thiserror::Error;
 use tokio::task::JoinSet;
 
@@ -22,6 +21,7 @@ use super::{
     shared::{Guard, Shared},
 };
 use crate::{
+    net,
     tls::{self, NodeCertificate, TlsError},
     trust::{Identity, Principal},
 };
@@ -47,8 +47,6 @@ const SEND_WINDOW_BYTES: u64 = 32 << 20;
 /// The largest UDP payload tried. Ten of them, the network stack's segments for each system call, must fit one UDP
 /// datagram of 65,507 bytes: loopback carries them with a fifth of the packets that Ethernet's 1,452 would need.
 const MAX_DATAGRAM_BYTES: u16 = 6_400;
-/// What is asked of the system for each socket's buffers; it may give less (`net.core.rmem_max`).
-const SOCKET_BUFFER_BYTES: usize = 4 << 20;
 /// How long `shutdown` waits for the peers to hear of it.
 const SHUTDOWN_TIMEOUT: Duration = Duration::from_secs(1);
 
@@ -289,24 +287,9 @@ async fn dial_one(target: SocketAddr, config: ClientConfig) -> Result<Connection
 }
 
 fn endpoint(address: SocketAddr, server: Option<ServerConfig>) -> io::Result<Endpoint> {
-    let socket = socket(address)?;
     let mut config = EndpointConfig::default();
     config.max_udp_payload_size(MAX_DATAGRAM_BYTES).map_err(io::Error::other)?;
-    Endpoint::new(config, server, socket, Arc::new(TokioRuntime))
-}
-
-fn socket(address: SocketAddr) -> io::Result<UdpSocket> {
-    let socket = Socket::new(Domain::for_address(address), Type::DGRAM, Some(Protocol::UDP))?;
-    for outcome in
-        [socket.set_recv_buffer_size(SOCKET_BUFFER_BYTES), socket.set_send_buffer_size(SOCKET_BUFFER_BYTES)]
-    {
-        // Smaller buffers only cost speed.
-        if let Err(error) = outcome {
-            tracing::debug!(%error, "the system keeps its default socket buffers");
-        }
-    }
-    socket.bind(&address.into())?;
-    Ok(socket.into())
+    Endpoint::new_with_abstract_socket(config, server, net::datagrams(address)?, Arc::new(TokioRuntime))
 }
 
 fn transport_config() -> TransportConfig {
