@@ -91,6 +91,7 @@ async fn tell_lines(progress: &mut watch::Receiver<Progress>, units: Units) {
                 "event": "progress",
                 "jobs_done": now.jobs_done,
                 "jobs_known": now.jobs_known,
+                "jobs_journalled": now.jobs_journalled,
                 "replanned": now.replanned,
                 "nodes": now.nodes,
                 "tasks": now.active_tasks.iter().map(|name| &**name).collect::<Vec<&str>>(),
@@ -153,12 +154,13 @@ fn message(now: &Progress, units: &Units, elapsed: Duration) -> String {
     if now.coordinator == CoordinatorLink::Reconnecting {
         return "coordinator lost, trying again; nodes go on working".to_owned();
     }
-    if now.jobs_done == 0 || units.jobs == 0 {
+    // What a journal had took no time.
+    let computed = now.jobs_done - now.jobs_journalled;
+    if computed == 0 || units.jobs == 0 {
         return String::new();
     }
-    let share = count(now.jobs_done) / count(units.jobs);
-    let rate = units.total * share / elapsed.as_secs_f64();
-    let left = elapsed.mul_f64((1.0 - share).max(0.0) / share);
+    let rate = units.total * count(computed) / count(units.jobs) / elapsed.as_secs_f64();
+    let left = elapsed.mul_f64(count(units.jobs.saturating_sub(now.jobs_done)) / count(computed));
     format!("{} {}/s  ETA {}  nodes {}", HumanCount(whole(rate)), units.name, clock(left), now.nodes)
 }
 
@@ -204,6 +206,8 @@ mod tests {
         let now = Progress { jobs_done: 25, jobs_known: 100, nodes: 3, ..Progress::default() };
         let units = Units { jobs: 100, total: 1_000_000.0, name: "samples", early: None };
         assert_eq!(message(&now, &units, Duration::from_secs(10)), "25,000 samples/s  ETA 30s  nodes 3");
+        let resumed = Progress { jobs_done: 75, jobs_journalled: 50, ..now.clone() };
+        assert_eq!(message(&resumed, &units, Duration::from_secs(10)), "25,000 samples/s  ETA 10s  nodes 3");
         let stuck = Progress { waiting: Some(WaitReason::NoNode), ..now };
         assert!(message(&stuck, &units, Duration::from_secs(10)).contains("no node"));
     }
