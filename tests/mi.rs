@@ -110,7 +110,7 @@ fn a_run_with_a_journal_goes_on_from_it_with_the_same_bytes() {
     let input = alignment(&folder, 160, 40);
     let farm = Farm::with_cpu_workers(1);
     let out = |name: &str| -> PathBuf { folder.path().join(name) };
-    let iterations = ["--iterations", "600"];
+    let iterations = ["--iterations", "200"];
     finish(start(&farm, &input, &out("quiet"), &iterations));
 
     let resume = [&iterations[..], &["--resume"]].concat();

@@ -599,11 +599,9 @@ async fn an_application_that_ends_in_mid_run_goes_on_from_its_journal() {
     let brought = second.lock().unwrap().clone();
     assert_eq!(brought.len(), JOBS as usize, "none twice");
     assert_eq!(brought.into_iter().collect::<BTreeSet<_>>(), (0..JOBS).collect(), "none missing");
-    let executed: u64 = executed(&farm).await.iter().sum();
-    println!(
-        "s09: {first} of {JOBS} retrieved before the end, {} executed again",
-        executed - u64::from(JOBS)
-    );
+    // What was on its way when its application left is not counted by the coordinator; the window bounds it.
+    let executed = executed(&farm).await.iter().sum::<u64>() + u64::try_from(window.jobs).unwrap();
+    println!("s09: {first} of {JOBS} retrieved before the end, at most {executed} executed in all");
     assert!(executed <= u64::from(JOBS) * 21 / 20, "executed {executed}");
     app.close().await;
 
