@@ -3,6 +3,7 @@
 
 use std::{fs, path::Path};
 
+use client_sdk::Journal;
 use tempfile::TempDir;
 use tests::{Farm, Process, Signal, farmctl};
 
@@ -17,9 +18,13 @@ fn cornell(folder: &TempDir) -> String {
 }
 
 fn start_render(farm: &Farm, scene: &str, image: &Path) -> Process {
+    start_render_with(farm, scene, image, &[])
+}
+
+fn start_render_with(farm: &Farm, scene: &str, image: &Path, more: &[&str]) -> Process {
     let image = image.display().to_string();
     let fixed = ["--coordinator", &farm.grpc, "render", scene, "-o", &image, "--progress", "ndjson"];
-    Process::start("farmctl", fixed.iter().chain(RENDER.iter()))
+    Process::start("farmctl", fixed.iter().chain(RENDER.iter()).chain(more))
 }
 
 fn finish_render(render: Process, image: &Path) -> Vec<u8> {
@@ -54,6 +59,81 @@ fn an_image_survives_a_killed_worker_and_a_joining_one_byte_for_byte() {
 
     assert_eq!(quiet.len(), disturbed.len(), "the images differ in size");
     assert!(quiet == disturbed, "the images differ in bytes");
+}
+
+/// Scenario 9, as people see it: the application's process is killed in mid-render, and the same command goes on.
+#[test]
+fn a_render_that_was_killed_goes_on_from_its_journal_byte_for_byte() {
+    let folder = TempDir::new().expect("a temporary folder");
+    let scene = cornell(&folder);
+    let farm = Farm::with_cpu_workers(2);
+    let quiet_image = folder.path().join("quiet.exr");
+    let quiet = finish_render(start_render(&farm, &scene, &quiet_image), &quiet_image);
+
+    let image = folder.path().join("killed.exr");
+    let journal = folder.path().join("killed.exr.gleaner-journal");
+    let mut render = start_render_with(&farm, &scene, &image, &["--resume"]);
+    // A result has some hundred kilobytes: some are whole.
+    let written = || fs::metadata(&journal).map_or(0, |file| file.len());
+    render
+        .wait_for(|line| line["jobs_done"].as_u64().is_some_and(|done| done >= 24) && written() > 2_000_000);
+    render.signal(Signal::Kill);
+    let (status, _) = render.finish();
+    assert!(!status.success() && !image.exists(), "it was killed before it wrote an image");
+    let label = "render, 160x128 px, 32 spp, seed 7";
+    let kept = Journal::open(&journal, label).expect("what a kill leaves can be used").results();
+    assert!(kept > 0, "some results are in the journal");
+
+    // Another picture under the same name: refused with the reason and what to do, and nothing is lost.
+    let other =
+        ["--coordinator", &farm.grpc, "render", &scene, "-o", &image.display().to_string(), "--resume"];
+    let refused = farmctl(other.iter().chain(&["--size", "32x32", "--spp", "2"]));
+    let words = String::from_utf8_lossy(&refused.stderr).into_owned();
+    assert_eq!(refused.status.code(), Some(2), "{words}");
+    assert!(words.contains("of another run") && words.contains("32x32") && words.contains("rm "), "{words}");
+
+    let mut resumed = start_render_with(&farm, &scene, &image, &["--resume"]);
+    let done = resumed.wait_for(|line| line["event"] == "done");
+    let (status, stderr) = resumed.finish();
+    assert!(status.success(), "{status}; stderr:\n{stderr}");
+    assert!(stderr.contains(&format!("{kept} results")), "what was taken over is said:\n{stderr}");
+    assert_eq!(done["jobs_journalled"].as_u64(), Some(kept), "{done}");
+    println!("s09: {kept} of {} jobs taken over", done["jobs"]);
+    assert!(fs::read(&image).expect("the image is there") == quiet, "the images differ in bytes");
+    assert!(!journal.exists(), "a journal is removed when the image is written");
+}
+
+#[test]
+fn a_scene_that_was_changed_does_not_meet_old_results() {
+    let folder = TempDir::new().expect("a temporary folder");
+    let scene = cornell(&folder);
+    let farm = Farm::with_cpu_workers(1);
+    let image = folder.path().join("image.exr");
+    let mut render = start_render_with(&farm, &scene, &image, &["--resume"]);
+    wait_until_jobs_done(&mut render, 2);
+    render.signal(Signal::Term);
+    let (status, stderr) = render.finish();
+    assert_eq!(status.code(), Some(1), "an incomplete image is not a success; stderr:\n{stderr}");
+    assert!(stderr.contains("the same command goes on"), "what to do is said:\n{stderr}");
+
+    let materials = folder.path().join("cornell");
+    let materials =
+        fs::read_dir(materials).expect("the scene's folder").map(|entry| entry.expect("a file").path());
+    let materials = materials.into_iter().find(|path| path.extension().is_some_and(|end| end == "mtl"));
+    let materials = materials.expect("the scene has materials");
+    let text = fs::read_to_string(&materials).expect("the materials");
+    let changed = text.replacen("Kd 0.", "Kd 0.0", 1);
+    assert_ne!(text, changed, "a colour is darker now");
+    fs::write(&materials, changed).expect("the folder is writable");
+    let (status, stderr) = start_render_with(&farm, &scene, &image, &["--resume"]).finish();
+    assert_eq!(status.code(), Some(2), "stderr:\n{stderr}");
+    assert!(stderr.contains("of other inputs"), "the reason is said:\n{stderr}");
+
+    fs::write(&materials, text).expect("the folder is writable");
+    let mut resumed = start_render_with(&farm, &scene, &image, &["--resume"]);
+    let done = resumed.wait_for(|line| line["event"] == "done");
+    assert!(done["jobs_journalled"].as_u64().is_some_and(|jobs| jobs >= 2), "nothing was lost: {done}");
+    assert!(resumed.finish().0.success(), "and the image is complete");
 }
 
 #[test]

@@ -105,6 +105,38 @@ fn the_farm_does_not_show_in_the_bytes() {
 }
 
 #[test]
+fn a_run_with_a_journal_goes_on_from_it_with_the_same_bytes() {
+    let folder = TempDir::new().expect("a temporary folder");
+    let input = alignment(&folder, 160, 40);
+    let farm = Farm::with_cpu_workers(1);
+    let out = |name: &str| -> PathBuf { folder.path().join(name) };
+    let iterations = ["--iterations", "200"];
+    finish(start(&farm, &input, &out("quiet"), &iterations));
+
+    let resume = [&iterations[..], &["--resume"]].concat();
+    let mut run = start(&farm, &input, &out("resumed"), &resume);
+    run.wait_for(|line| done(line, 2));
+    run.signal(Signal::Term);
+    let (status, stderr) = run.finish();
+    assert_eq!(status.code(), Some(1), "an incomplete result is not a success; stderr:\n{stderr}");
+    assert!(stderr.contains("the same command goes on"), "what to do is said:\n{stderr}");
+    assert_eq!(fs::read_dir(out("resumed")).expect("the folder").count(), 1, "the journal is all there is");
+    let (status, stderr) =
+        start(&farm, &input, &out("resumed"), &[&resume[..], &["--seed", "2"]].concat()).finish();
+    assert_eq!(status.code(), Some(2), "another seed is another run; stderr:\n{stderr}");
+
+    let mut run = start(&farm, &input, &out("resumed"), &resume);
+    let summary = run.wait_for(|line| line["event"] == "done");
+    assert!(summary["jobs_journalled"].as_u64().is_some_and(|jobs| jobs >= 2), "{summary}");
+    finish(run);
+    assert_same(&out("quiet"), &out("resumed"), "stopped and resumed");
+    assert!(
+        !out("resumed").join("gleaner-journal").exists(),
+        "a journal is removed when the results are written"
+    );
+}
+
+#[test]
 fn an_interrupted_run_leaves_what_can_be_continued() {
     let folder = TempDir::new().expect("a temporary folder");
     let input = alignment(&folder, 160, 40);

@@ -9,7 +9,7 @@ use farm_core::{
 };
 use thiserror::Error;
 
-use crate::{graph::GraphError, job::RetrieveError, task::TaskError};
+use crate::{graph::GraphError, job::RetrieveError, journal::JournalError, task::TaskError};
 
 /// Why connecting or a run failed.
 #[derive(Debug, Error)]
@@ -78,6 +78,10 @@ pub enum FarmError {
     /// The graph cannot be run.
     #[error(transparent)]
     Graph(#[from] GraphError),
+    /// The run's journal cannot be read, or not be added to: what the disk had no room for, say, is retrieved, but will be computed
+    /// again by a process that resumes.
+    #[error(transparent)]
+    Journal(#[from] JournalError),
     /// A task's `prepare` or `finish` failed.
     #[error("task `{task}`, {stage}: {error}")]
     Task {
@@ -192,6 +196,7 @@ impl FarmError {
             | Self::Refused { .. }
             | Self::Denied { .. }
             | Self::Graph(_)
+            | Self::Journal(_)
             | Self::Task { .. }
             | Self::Dispatch { .. }
             | Self::Program { .. }

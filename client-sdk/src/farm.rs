@@ -16,9 +16,10 @@ use tokio::{
 
 use crate::{
     content::ContentStore,
-    driver::{DriverHandle, DriverSetup, drive},
+    driver::{Acknowledge, DriverHandle, DriverSetup, drive},
     error::FarmError,
     graph::TaskGraph,
+    journal::Journal,
     options::FarmOptions,
     progress::{Progress, RunSummary},
     run::{Run, RunEnd, RunEvent},
@@ -112,6 +113,24 @@ impl Farm {
     /// # Errors
     /// See [`FarmError`]; the first cause ends the run, and its outstanding jobs are cancelled.
     pub async fn run(&self, graph: TaskGraph) -> Result<RunSummary, FarmError> {
+        self.run_with(graph, None).await
+    }
+
+    /// The same with a journal: each result goes there once its job has taken it, and only then may its node forget it. Another
+    /// process that runs the same graph with the same journal goes on from there: `dispatch` is called as ever, and `retrieve` of
+    /// the jobs whose programs the journal has results of, with the bytes that it has, once each. So an application that was killed
+    /// comes to the same state by the same calls, and what it had retrieved is not computed again.
+    ///
+    /// The file stays when the run has ended, in whatever way; remove it when what became of the results is safe.
+    ///
+    /// # Errors
+    /// Those of [`Self::run`], and [`FarmError::Journal`]: it is of another run, damaged, or cannot be added to. What was retrieved
+    /// before a full disk stays in it.
+    pub async fn run_journalled(&self, graph: TaskGraph, journal: Journal) -> Result<RunSummary, FarmError> {
+        self.run_with(graph, Some(journal)).await
+    }
+
+    async fn run_with(&self, graph: TaskGraph, journal: Option<Journal>) -> Result<RunSummary, FarmError> {
         let nodes = graph.check()?;
         if nodes.is_empty() {
             return Ok(RunSummary::default());
@@ -123,12 +142,14 @@ impl Farm {
             .map_err(|_| FarmError::Closed)?;
         let tasks = first..first + count;
         let (events_sender, events) = std_mpsc::channel();
-        self.driver.start_run(tasks.clone(), events_sender.clone()).await?;
+        let acknowledge = if journal.is_some() { Acknowledge::WhenKept } else { Acknowledge::AtOnce };
+        self.driver.start_run(tasks.clone(), events_sender.clone(), acknowledge).await?;
         let abandoned = EndWhenDropped(events_sender.clone());
         let run = Run {
             tasks: tasks.clone(),
             nodes,
             window: self.options.window,
+            journal,
             store: self.store.clone(),
             driver: self.driver.clone(),
             progress: self.progress.clone(),

@@ -86,6 +86,15 @@ impl JobResult {
     }
 }
 
+/// Cuts a payload into its sections; no bytes are copied. Who calls has checked that the lengths add up.
+pub(crate) fn split_sections(mut payload: Bytes, sections: &[u64]) -> Vec<Bytes> {
+    let cut = |length: &u64| {
+        let length = usize::try_from(*length).expect("a section is a part of a payload in memory");
+        payload.split_to(length)
+    };
+    sections.iter().map(cut).collect()
+}
+
 /// A result could not be used. Not retried: the same job would give the same result.
 #[derive(Debug, Error)]
 pub enum RetrieveError {

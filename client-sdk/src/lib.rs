@@ -84,6 +84,7 @@ mod error;
 mod farm;
 mod graph;
 mod job;
+mod journal;
 mod options;
 mod progress;
 mod run;
@@ -104,6 +105,7 @@ pub use crate::{
     farm::{Farm, StopHandle},
     graph::{GraphError, TaskGraph},
     job::{Job, JobResult, RetrieveError},
+    journal::{Journal, JournalError},
     options::{FarmOptions, Window},
     progress::{CoordinatorLink, Progress, RunSummary, TaskSummary},
     task::{Task, TaskError, TaskProgress},

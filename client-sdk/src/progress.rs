@@ -9,6 +9,8 @@ use farm_core::message::WaitReason;
 pub struct Progress {
     /// Jobs whose results were retrieved, over all runs of this connection.
     pub jobs_done: u64,
+    /// Of these, those whose results an earlier process had left in a journal.
+    pub jobs_journalled: u64,
     /// Jobs that the tasks have made so far; grows while tasks make more.
     pub jobs_known: u64,
     /// New attempts after losses and steals.
@@ -42,6 +44,8 @@ pub enum CoordinatorLink {
 pub struct RunSummary {
     /// Jobs retrieved.
     pub jobs: u64,
+    /// Of these, those whose results an earlier process had left in the journal.
+    pub journalled: u64,
     /// New attempts after losses and steals (of this connection while the run went).
     pub replanned: u64,
     /// Measured device time of the jobs.

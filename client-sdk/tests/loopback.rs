@@ -10,7 +10,8 @@ use std::{
 
 use client_sdk::{
     Content, CostNs, DispatchError, Farm, FarmError, FarmOptions, Job, JobFailure, JobProgram, JobResult,
-    Requirements, RetrieveError, Task, TaskData, TaskError, TaskGraph, TaskProgress, WaitReason, Window,
+    Journal, Requirements, RetrieveError, Task, TaskData, TaskError, TaskGraph, TaskProgress, WaitReason,
+    Window,
 };
 use coordinator::{CoordinatorHandle, CoordinatorOptions};
 use worker::{WorkerHandle, WorkerOptions};
@@ -576,5 +577,77 @@ async fn an_application_that_is_refused_hears_why() {
             "{refused}"
         );
     }
+    farm.stop().await;
+}
+
+/// Scenario 9: what was retrieved before the end is not computed again, and is retrieved again in the new process.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn an_application_that_ends_in_mid_run_goes_on_from_its_journal() {
+    const JOBS: u32 = 400;
+    let folder = tempfile::tempdir().unwrap();
+    let open = || Journal::open(folder.path().join("journal"), "echoes").unwrap();
+    let mut farm = TestFarm::start(2, &["sim", "sim"]).await;
+    let graph = |brought: &Brought| {
+        let brought = Arc::clone(brought);
+        let cost = CostNs(1_000_000);
+        TaskGraph::new()
+            .task("echo", Echoes { jobs: JOBS, cost, module: module(), brought, ..Echoes::default() })
+    };
+    // What is on its way at the end is computed again: this many at most, 2 %.
+    let window = Window { jobs: 8, ..Window::default() };
+
+    let first = Brought::default();
+    let app = Farm::connect(FarmOptions { window, ..farm.options() }).await.unwrap();
+    let mut progress = app.progress();
+    tokio::select! {
+        outcome = app.run_journalled(graph(&first), open()) => panic!("it was to end before: {outcome:?}"),
+        _ = progress.wait_for(|progress| progress.jobs_done >= u64::from(JOBS) / 2) => {}
+    }
+    progress.wait_for(|progress| progress.active_tasks.is_empty()).await.unwrap();
+    drop(app);
+    let first = u64::try_from(first.lock().unwrap().len()).unwrap();
+    let journal = open();
+    assert_eq!(journal.results(), first, "all that was retrieved is kept");
+
+    let second = Brought::default();
+    let app = farm.connect().await;
+    let summary = app.run_journalled(graph(&second), journal).await.unwrap();
+    assert_eq!((summary.jobs, summary.journalled), (u64::from(JOBS), first));
+    assert_eq!(app.progress().borrow().jobs_journalled, first);
+    let brought = second.lock().unwrap().clone();
+    assert_eq!(brought.len(), JOBS as usize, "none twice");
+    assert_eq!(brought.into_iter().collect::<BTreeSet<_>>(), (0..JOBS).collect(), "none missing");
+    // What was on its way when its application left is not counted by the coordinator; the window bounds it.
+    let executed = executed(&farm).await.iter().sum::<u64>() + u64::try_from(window.jobs).unwrap();
+    println!("s09: {first} of {JOBS} retrieved before the end, at most {executed} executed in all");
+    assert!(executed <= u64::from(JOBS) * 21 / 20, "executed {executed}");
+    app.close().await;
+
+    // Nothing is left to do: no device is needed.
+    for worker in farm.workers.drain(..) {
+        worker.drain().await;
+    }
+    let third = Brought::default();
+    let app = farm.connect().await;
+    assert_eq!(app.run_journalled(graph(&third), open()).await.unwrap().journalled, u64::from(JOBS));
+    assert_eq!(third.lock().unwrap().len(), JOBS as usize);
+    app.close().await;
+    farm.stop().await;
+}
+
+/// The last results are acknowledged too: no node keeps what is in the journal.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn what_is_in_the_journal_is_acknowledged() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut farm = TestFarm::start(0, &[]).await;
+    // Room for the results of two jobs: without acknowledgements the third would wait for ever.
+    farm.add_worker(&["sim"], |options| WorkerOptions { spool_quota_bytes: 24, ..options }).await;
+    let app = farm.connect().await;
+    let brought = Brought::default();
+    let task = Echoes { jobs: 200, brought: Arc::clone(&brought), ..Echoes::default() };
+    let journal = Journal::open(folder.path().join("journal"), "echoes").unwrap();
+    assert_eq!(app.run_journalled(TaskGraph::new().task("echo", task), journal).await.unwrap().jobs, 200);
+    assert_eq!(brought.lock().unwrap().len(), 200);
+    app.close().await;
     farm.stop().await;
 }

@@ -416,6 +416,8 @@ fn ledger_event(step: Step) -> ledger::Event {
         }),
         22 if step.four == 0 => ledger::Event::Cancelled(TaskId(step.three.into())),
         23 if step.four == 0 && step.three == 0 => ledger::Event::Finished,
+        24 if step.four == 0 => ledger::Event::Journalled(TaskId(step.three.into())),
+        24 => ledger::Event::Kept { task: TaskId(step.three.into()), index: JobIndex(step.one.into()) },
         _ => ledger::Event::FromCoordinator(CoordinatorToApp::HeartbeatAck { sequence: 1 }),
     }
 }
@@ -538,7 +540,7 @@ proptest! {
     }
 
     #[test]
-    fn the_ledger_keeps_its_invariants(steps in steps(25)) {
+    fn the_ledger_keeps_its_invariants(steps in steps(26)) {
         judge_ledger(&steps);
     }
 }

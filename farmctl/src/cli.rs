@@ -139,6 +139,10 @@ pub(crate) struct RenderArgs {
     /// Same seed, same kind of device: same image, byte for byte.
     #[arg(long, default_value_t = 1)]
     pub seed: u64,
+    /// Keep results in a journal beside the first image (IMAGE.gleaner-journal), and go on from it if it is there: after a crash
+    /// or ^C the same command computes what is left. It is removed when the images are written.
+    #[arg(long)]
+    pub resume: bool,
     /// Brightness of the PNG in stops.
     #[arg(long, default_value_t = 0.0, allow_negative_numbers = true, value_parser = stops)]
     pub exposure: f32,
@@ -169,6 +173,10 @@ pub(crate) struct MiArgs {
     /// Go on from the sums in the folder, up to ITERATIONS in all: the same bytes as in one run.
     #[arg(long)]
     pub extend: bool,
+    /// Keep results of jobs in a journal in the folder, and go on from it if it is there: after a crash or ^C the same command
+    /// computes what is left. It is removed when the results are written; before that nothing else is.
+    #[arg(long)]
+    pub resume: bool,
     /// Leaves out sequences with residues in less than this share of the columns, 0 to 1.
     #[arg(long, value_name = "SHARE", value_parser = share)]
     pub min_coverage: Option<f64>,

@@ -4,6 +4,8 @@ use std::process::ExitCode;
 
 use client_sdk::FarmError;
 
+use crate::journal;
+
 /// Why a command failed, as its exit code sees it.
 #[derive(Debug)]
 pub(crate) enum Failure {
@@ -51,6 +53,7 @@ impl Failure {
             | FarmError::CoordinatorLost { .. }
             | FarmError::NoNodeReached { .. } => Self::Unreachable(error.into()),
             FarmError::Denied { .. } => Self::Denied(error.into()),
+            FarmError::Journal(error) => journal::failure(error),
             error => Self::Work(error.into()),
         }
     }

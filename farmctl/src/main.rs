@@ -15,6 +15,7 @@ mod cli;
 mod command;
 mod embedded;
 mod failure;
+mod journal;
 mod output;
 mod process_farm;
 mod progress;

@@ -40,6 +40,11 @@ pub(crate) fn moved(attempts: u64) -> String {
     }
 }
 
+/// What a run's last line says of jobs whose results were in a journal; nothing if none were.
+pub(crate) fn taken_over(jobs: u64) -> String {
+    if jobs == 0 { String::new() } else { format!(", {jobs} of them from the journal") }
+}
+
 /// An empty table with a header and no lines.
 pub(crate) fn table<const N: usize>(header: [&str; N]) -> Table {
     let mut table = Table::new();

@@ -95,6 +95,7 @@ async fn tell_lines(progress: &mut watch::Receiver<Progress>, units: Units) {
                 "jobs_done": now.jobs_done,
                 "jobs_known": now.jobs_known,
                 "share": (early.units.share)(&now),
+                "jobs_journalled": now.jobs_journalled,
                 "replanned": now.replanned,
                 "nodes": now.nodes,
                 "tasks": now.active_tasks.iter().map(|name| &**name).collect::<Vec<&str>>(),
@@ -158,11 +159,14 @@ fn message(now: &Progress, units: &Units, elapsed: Duration) -> String {
         return "coordinator lost, trying again; nodes go on working".to_owned();
     }
     let share = (units.share)(now);
-    if share <= 0.0 {
+    let computed = now.jobs_done - now.jobs_journalled;
+    if share <= 0.0 || computed == 0 {
         return String::new();
     }
-    let rate = units.total * share / elapsed.as_secs_f64();
-    let left = elapsed.mul_f64((1.0 - share).max(0.0) / share);
+    // What a journal had took no time.
+    let computed = share * count(computed) / count(now.jobs_done);
+    let rate = units.total * computed / elapsed.as_secs_f64();
+    let left = elapsed.mul_f64((1.0 - share).max(0.0) / computed);
     format!("{} {}/s  ETA {}  nodes {}", HumanCount(whole(rate)), units.name, clock(left), now.nodes)
 }
 
@@ -185,6 +189,11 @@ fn clock(duration: Duration) -> String {
     }
 }
 
+#[expect(clippy::cast_precision_loss, reason = "a count for people")]
+fn count(number: u64) -> f64 {
+    number as f64
+}
+
 #[expect(
     clippy::cast_possible_truncation,
     clippy::cast_sign_loss,
@@ -204,6 +213,8 @@ mod tests {
         let share = Arc::new(|now: &Progress| now.jobs_done as f64 / 100.0);
         let units = Units { share, total: 1_000_000.0, name: "samples", early: None };
         assert_eq!(message(&now, &units, Duration::from_secs(10)), "25,000 samples/s  ETA 30s  nodes 3");
+        let resumed = Progress { jobs_done: 75, jobs_journalled: 50, ..now.clone() };
+        assert_eq!(message(&resumed, &units, Duration::from_secs(10)), "25,000 samples/s  ETA 10s  nodes 3");
         let stuck = Progress { waiting: Some(WaitReason::NoNode), ..now };
         assert!(message(&stuck, &units, Duration::from_secs(10)).contains("no node"));
     }

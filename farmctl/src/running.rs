@@ -1,6 +1,6 @@
 //! A graph of tasks run for a person: progress is told, signals stop it in order. Never knows what the tasks compute.
 
-use client_sdk::{Farm, FarmError, FarmOptions, RunSummary, TaskGraph};
+use client_sdk::{Farm, FarmError, FarmOptions, Journal, RunSummary, TaskGraph};
 use tokio::signal::unix::{Signal, SignalKind, signal};
 
 use crate::{
@@ -9,10 +9,11 @@ use crate::{
     progress::{self, Units},
 };
 
-/// Runs the graph on a farm, with stealing between its nodes; the first signal stops it in order, the second one ends the process.
+/// Runs the graph on a farm, with a journal if there is one, and with stealing between its nodes; the first signal stops it in order, the second one ends the process.
 pub(crate) async fn run_graph(
     options: FarmOptions,
     graph: TaskGraph,
+    journal: Option<Journal>,
     style: ProgressStyle,
     units: Units,
     stops: &mut Stops,
@@ -21,7 +22,12 @@ pub(crate) async fn run_graph(
     let teller = tokio::spawn(progress::tell(farm.progress(), style, units));
     let stop = farm.stop_handle();
     let result = {
-        let running = farm.run(graph);
+        let running = async {
+            match journal {
+                Some(journal) => farm.run_journalled(graph, journal).await,
+                None => farm.run(graph).await,
+            }
+        };
         tokio::pin!(running);
         tokio::select! {
             result = &mut running => result,

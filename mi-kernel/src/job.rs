@@ -68,6 +68,15 @@ pub enum Mode {
     Matrix,
 }
 
+/// How long jobs are.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum JobLengths {
+    /// By what an iteration was measured to take so far.
+    Measured,
+    /// The same jobs in each run of the same options: what a journal needs to know them again.
+    Fixed,
+}
+
 /// What to compute of an alignment.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct MiOptions {
@@ -77,6 +86,8 @@ pub struct MiOptions {
     pub seed: Seed,
     /// What jobs bring back.
     pub mode: Mode,
+    /// How iterations become jobs.
+    pub lengths: JobLengths,
     /// Sums of an earlier run; the iterations in them are not computed again.
     pub earlier: Option<Accumulators>,
     /// Accepted only where the result does not matter, as in a bench of the farm: it is zeros then.
@@ -161,7 +172,7 @@ impl MiHandle {
 pub fn mi_graph(alignment: Arc<Alignment>, options: MiOptions) -> Result<(TaskGraph, MiHandle), MiError> {
     let shape = Shape::new(&alignment)?;
     Reference::unscored(&alignment)?;
-    let MiOptions { iterations, seed, mode, earlier, simulated } = options;
+    let MiOptions { iterations, seed, mode, lengths, earlier, simulated } = options;
     if iterations > MAX_ITERATIONS {
         return Err(MiError::Iterations { iterations });
     }
@@ -172,7 +183,7 @@ pub fn mi_graph(alignment: Arc<Alignment>, options: MiOptions) -> Result<(TaskGr
     if let Some((held, _)) = sums.maxima().last_key_value().filter(|(held, _)| **held >= iterations) {
         return Err(MiError::Earlier { held: *held, iterations });
     }
-    let lengths = Lengths::new(&shape, mode, iterations);
+    let lengths = Lengths::new(&shape, mode, lengths, iterations);
     let remaining = Remaining::new(&sums, iterations);
     let earlier = sums.iterations() as u64;
     let shared = Arc::new(Shared {
@@ -197,6 +208,7 @@ pub fn mi_graph(alignment: Arc<Alignment>, options: MiOptions) -> Result<(TaskGr
 #[derive(Clone, Copy, Debug)]
 struct Lengths {
     mode: Mode,
+    by: JobLengths,
     pairs: u64,
     /// While nothing is known of the devices: long enough for a fast one, short enough that many share the run.
     first: u64,
@@ -204,7 +216,7 @@ struct Lengths {
 }
 
 impl Lengths {
-    fn new(shape: &Shape, mode: Mode, iterations: u64) -> Self {
+    fn new(shape: &Shape, mode: Mode, by: JobLengths, iterations: u64) -> Self {
         let pairs = shape.pairs() as u64;
         let long = JOB_COUNTS / (pairs * u64::from(shape.rows())).max(1);
         let commands = JOB_COMMANDS / (4 + 3 * shape.chunks().len() as u64);
@@ -214,7 +226,7 @@ impl Lengths {
         };
         let most = JOB_ITERATIONS.min(commands).min(held).max(1);
         let first = long.min(iterations.div_ceil(LEAST_JOBS)).clamp(1, most);
-        Self { mode, pairs, first, most }
+        Self { mode, by, pairs, first, most }
     }
 
     /// Iterations of the next job, `left` being without one. `iteration_s` is what one took so far: where sums are large
@@ -226,8 +238,8 @@ impl Lengths {
         reason = "a length that is bounded right after; `as` saturates"
     )]
     fn next(&self, left: u64, iteration_s: Option<f64>) -> u64 {
-        let by_result = match (self.mode, iteration_s) {
-            (Mode::Reduce, Some(iteration_s)) => {
+        let by_result = match (self.mode, self.by, iteration_s) {
+            (Mode::Reduce, JobLengths::Measured, Some(iteration_s)) => {
                 (self.result_bytes(1) as f64 / (SUMS_BYTES_PER_S * iteration_s)) as u64
             }
             _ => 0,
@@ -485,6 +497,7 @@ mod tests {
             iterations,
             seed: Seed(1),
             mode: Mode::Reduce,
+            lengths: JobLengths::Measured,
             earlier,
             simulated: SimulatedDevices::Refused,
         }
@@ -517,7 +530,11 @@ mod tests {
         let alignment = parse(b"ACA\nACC\nGTA\nGTC\n").unwrap().alignment;
         let shape = Shape::new(&alignment).unwrap();
         for (iterations, expected) in [(0, 1), (1, 1), (64, 1), (1_000, 16), (1 << 20, 256)] {
-            assert_eq!(Lengths::new(&shape, Mode::Reduce, iterations).first, expected, "{iterations}");
+            assert_eq!(
+                Lengths::new(&shape, Mode::Reduce, JobLengths::Fixed, iterations).first,
+                expected,
+                "{iterations}"
+            );
         }
         assert!(mi_graph(Arc::new(alignment), options(MAX_ITERATIONS + 1, None)).is_err());
     }
@@ -525,13 +542,16 @@ mod tests {
     #[test]
     fn jobs_are_as_long_as_their_results_are_large_and_short_at_the_end() {
         // The thesis' second set on an H200: 252 MB of sums, 44 ms an iteration.
-        let lengths = Lengths { mode: Mode::Reduce, pairs: 12_628_338, first: 3, most: 256 };
+        let by = JobLengths::Measured;
+        let lengths = Lengths { mode: Mode::Reduce, by, pairs: 12_628_338, first: 3, most: 256 };
         assert_eq!(lengths.next(10_000, None), 3);
         assert_eq!(lengths.next(10_000, Some(0.044)), 71);
         assert_eq!(lengths.next(240, Some(0.044)), 30);
         assert_eq!(lengths.next(1, Some(0.044)), 18);
         assert_eq!(lengths.next(10_000, Some(1e-6)), 256);
         assert_eq!(lengths.next(10_000, Some(130.0)), 3, "slow devices: results are no burden");
+        let fixed = Lengths { by: JobLengths::Fixed, ..lengths };
+        assert_eq!(fixed.next(10_000, Some(0.044)), 3, "the same in each run");
         let matrices = Lengths { mode: Mode::Matrix, ..lengths };
         assert_eq!(matrices.next(10_000, Some(0.044)), 3, "twice the iterations are twice the bytes");
         assert_eq!((lengths.in_flight(71, false), lengths.in_flight(71, true)), (8, 34));

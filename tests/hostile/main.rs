@@ -61,7 +61,7 @@ replays! {
     app_to_coordinator coordinator_to_app node_to_coordinator coordinator_to_node farm_status timeline_head timeline_segments
     plugin_question plugin_answer
     join_token principal certificate membership signing_request capability identity_file authority_file
-    control_store epoch_file
+    control_store epoch_file run_journal
     scene_toml scene_obj scene_mtl
     alignment alignment_fasta alignment_a2m alignment_a3m alignment_stockholm alignment_clustal alignment_plain saved_sums
     mi_result render_result

@@ -89,6 +89,10 @@ fn claimed(before: &[u8], claimed: u32, behind: usize) -> Vec<u8> {
 }
 
 pub(crate) const STORMS: &[Storm] = &[
+    storm("run_journal", "marks of records without records", || {
+        let header = &include_bytes!("../../fuzz/corpus/run_journal/valid-three")[..44];
+        [header, &b"\x89record\n".repeat(MANY / 8)].concat()
+    }),
     storm("frames_to_node", "frames without end", || vec![0; MANY]),
     storm("frames_to_node", "a frame of tickets that are not there", || {
         let header = claimed(&[1], 1 << 20, 300_000);

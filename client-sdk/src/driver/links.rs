@@ -8,7 +8,7 @@ use std::{
 
 use bytes::Bytes;
 use farm_core::{
-    id::{NodeId, NodeSession},
+    id::{ContentHash, NodeId, NodeSession},
     message::{AppToNode, Contact, JobTicket, NodeToApp, ResultHeader},
 };
 use proto::{
@@ -286,7 +286,11 @@ async fn listen(
                     room.take(payload.len()).await
                 }
             };
-            received.push(Received { message: header, payload: Payload { bytes: payload, permit } });
+            let digest = match &header {
+                NodeToApp::Result(result) => result.digest,
+                NodeToApp::Welcome { .. } | NodeToApp::Refused { .. } => ContentHash::EMPTY,
+            };
+            received.push(Received { message: header, payload: Payload { bytes: payload, digest, permit } });
         }
         if inputs.send(Input::NodeSaid { key, received }).await.is_err() {
             return CLOSED.to_owned();
@@ -347,7 +351,7 @@ impl ResultRoom {
 #[cfg(test)]
 mod tests {
     use farm_core::{
-        id::{AppId, Attempt, ContentHash, DeviceIndex, Epoch, JobAttempt, JobId, JobIndex, TaskId},
+        id::{AppId, Attempt, DeviceIndex, Epoch, JobAttempt, JobId, JobIndex, TaskId},
         message::JobFailure,
     };
 

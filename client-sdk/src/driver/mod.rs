@@ -57,7 +57,9 @@ type JobKey = (TaskId, JobIndex);
 /// What the owner task hears.
 pub(crate) enum Input {
     /// A run wants to hear of its tasks.
-    RunStarted { tasks: Range<u32>, events: std_mpsc::Sender<RunEvent> },
+    RunStarted { tasks: Range<u32>, events: std_mpsc::Sender<RunEvent>, acknowledge: Acknowledge },
+    /// Results of a run are in its journal.
+    Kept(Vec<JobKey>),
     /// A batch of a run.
     Submitted(Submission),
     /// A run has ended, in whatever way.
@@ -74,6 +76,15 @@ pub(crate) enum Input {
     NodeSaid { key: LinkKey, received: Vec<Received> },
     /// A link to a node could not be made, or is over.
     NodeEnded { key: LinkKey, reason: String },
+}
+
+/// When a run's results are acknowledged.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Acknowledge {
+    /// As they come.
+    AtOnce,
+    /// When they are in the run's journal.
+    WhenKept,
 }
 
 /// A batch of one task's jobs with their programs, in the same order.
@@ -102,8 +113,10 @@ impl DriverHandle {
         &self,
         tasks: Range<u32>,
         events: std_mpsc::Sender<RunEvent>,
+        acknowledge: Acknowledge,
     ) -> Result<(), FarmError> {
-        self.inputs.send(Input::RunStarted { tasks, events }).await.map_err(|_| FarmError::Closed)
+        let started = Input::RunStarted { tasks, events, acknowledge };
+        self.inputs.send(started).await.map_err(|_| FarmError::Closed)
     }
 
     /// From an async task: takes the announcement back.
@@ -115,6 +128,12 @@ impl DriverHandle {
     /// From a thread: submits a batch.
     pub(crate) fn submit(&self, submission: Submission) -> Result<(), FarmError> {
         self.inputs.blocking_send(Input::Submitted(submission)).map_err(|_| FarmError::Closed)
+    }
+
+    /// From a thread: says that results are safe.
+    pub(crate) fn kept(&self, jobs: Vec<JobKey>) {
+        // Without a driver there is nobody to acknowledge them to.
+        let _ = self.inputs.blocking_send(Input::Kept(jobs));
     }
 
     /// From a thread: says that nobody listens for these tasks any more.
@@ -252,9 +271,17 @@ impl Driver {
 
     fn take(&mut self, input: Input) {
         match input {
-            Input::RunStarted { tasks, events } => {
+            Input::RunStarted { tasks, events, acknowledge } => {
+                if acknowledge == Acknowledge::WhenKept {
+                    tasks.clone().for_each(|task| self.tell_ledger(Event::Journalled(TaskId(task))));
+                }
                 let refused = self.over.as_ref().map(|over| RunEnd::Farm(over.error(&self.options)));
                 self.runs.start(tasks, events, refused);
+            }
+            Input::Kept(jobs) => {
+                for (task, index) in jobs {
+                    self.tell_ledger(Event::Kept { task, index });
+                }
             }
             Input::Submitted(submission) => self.submitted(submission),
             Input::RunOver { tasks } => self.run_over(tasks),

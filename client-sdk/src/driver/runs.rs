@@ -123,7 +123,7 @@ impl Runs {
         }
     }
 
-    /// Jobs of one submission are asked for; a batch's jobs have one index after the other.
+    /// Jobs of one submission are asked for; a batch's jobs have ascending indices, those between belong to no other batch.
     pub(super) fn asked(&mut self, request: &PlanRequest) {
         if let (Some(first), Some(last)) = (request.jobs.first(), request.jobs.last()) {
             // What is asked again after a reconnect is a part of what was asked first.

@@ -168,16 +168,16 @@ const fn needs_of(summary: &ProgramSummary) -> Limits {
     }
 }
 
-/// What every job of a batch needs: the task's word, and the largest of what the programs say.
-pub(super) fn needs_of_batch(task: Requirements, jobs: &[Dispatched]) -> Requirements {
-    let limits = jobs.iter().fold(task.limits, |most, job| Limits {
-        memory_bytes: most.memory_bytes.max(job.needs.memory_bytes),
-        buffer_bytes: most.buffer_bytes.max(job.needs.buffer_bytes),
-        binding_bytes: most.binding_bytes.max(job.needs.binding_bytes),
-        storage_buffers: most.storage_buffers.max(job.needs.storage_buffers),
-        ..most
-    });
-    Requirements { limits, ..task }
+/// What every job of a batch needs, with one more in it: the task's word, and the largest of what the programs say.
+pub(super) fn needs_with(most: Requirements, job: &Dispatched) -> Requirements {
+    let limits = Limits {
+        memory_bytes: most.limits.memory_bytes.max(job.needs.memory_bytes),
+        buffer_bytes: most.limits.buffer_bytes.max(job.needs.buffer_bytes),
+        binding_bytes: most.limits.binding_bytes.max(job.needs.binding_bytes),
+        storage_buffers: most.limits.storage_buffers.max(job.needs.storage_buffers),
+        ..most.limits
+    };
+    Requirements { limits, ..most }
 }
 
 /// `retrieve()`, with a panic as a value.

@@ -2,6 +2,7 @@
 //! with the first cause. It never touches a socket: batches go to the driver, results come back as events.
 
 mod dispatch;
+mod journalled;
 #[cfg(test)]
 mod tests;
 mod window;
@@ -17,7 +18,7 @@ use std::{
 use bytes::Bytes;
 use farm_core::{
     device::Requirements,
-    id::{JobId, JobIndex, NodeId, TaskId},
+    id::{ContentHash, JobId, JobIndex, NodeId, TaskId},
     ledger::SubmittedJob,
     message::{JobFailure, WaitReason},
     program::Content,
@@ -25,7 +26,8 @@ use farm_core::{
 use tokio::sync::{OwnedSemaphorePermit, watch};
 
 use self::{
-    dispatch::{Dispatched, catch_panic, dispatch_chunk, needs_of_batch, retrieve},
+    dispatch::{Dispatched, catch_panic, dispatch_chunk, needs_with, retrieve},
+    journalled::{Replay, RunJournal},
     window::WindowUse,
 };
 use crate::{
@@ -33,7 +35,8 @@ use crate::{
     driver::{DriverHandle, Submission},
     error::FarmError,
     graph::GraphNode,
-    job::{Job, JobResult},
+    job::{Job, JobResult, split_sections},
+    journal::{About, Journal, Keep},
     options::Window,
     progress::{Progress, RunSummary, TaskSummary},
     task::{Task, TaskError, TaskProgress},
@@ -82,6 +85,8 @@ pub(crate) enum Arrival {
 #[derive(Debug)]
 pub(crate) struct Payload {
     pub(crate) bytes: Bytes,
+    /// Of the bytes.
+    pub(crate) digest: ContentHash,
     pub(crate) permit: Option<OwnedSemaphorePermit>,
 }
 
@@ -109,6 +114,8 @@ pub(crate) struct Run {
     pub(crate) tasks: Range<u32>,
     pub(crate) nodes: Vec<GraphNode>,
     pub(crate) window: Window,
+    /// Where results come from that an earlier process has taken, and where those go that this one takes.
+    pub(crate) journal: Option<Journal>,
     pub(crate) store: ContentStore,
     pub(crate) driver: DriverHandle,
     pub(crate) progress: watch::Sender<Progress>,
@@ -145,6 +152,8 @@ struct Active {
 struct Outstanding {
     job: Box<dyn Job>,
     program_bytes: usize,
+    /// Digest of its program, where results are kept by it.
+    program: Option<ContentHash>,
 }
 
 struct TaskState {
@@ -163,6 +172,9 @@ struct Runner {
     tasks: Range<u32>,
     states: Vec<TaskState>,
     window: WindowUse,
+    journal: Option<RunJournal>,
+    /// Outstanding jobs whose results are in it.
+    replays: VecDeque<Replay>,
     /// What the run's tasks have added, kept until the run ends.
     data: Vec<TaskData>,
     known: HashSet<Content>,
@@ -175,6 +187,8 @@ struct Runner {
     dispatch_time: Duration,
     /// Tasks on threads of their own.
     away: usize,
+    /// Jobs whose results were in the journal.
+    journalled: u64,
 }
 
 impl Run {
@@ -195,6 +209,8 @@ impl Run {
             tasks: self.tasks,
             states: self.nodes.into_iter().map(state).collect(),
             window: WindowUse::new(self.window),
+            journal: None,
+            replays: VecDeque::new(),
             data: Vec::new(),
             known: HashSet::new(),
             store: self.store,
@@ -204,12 +220,17 @@ impl Run {
             events_sender: self.events_sender,
             dispatch_time: Duration::ZERO,
             away: 0,
+            journalled: 0,
         };
         let uploaded_before = runner.store.served_bytes();
-        runner.run()?;
+        let outcome = runner.open_journal(self.journal).and_then(|()| runner.run());
+        // A complete run has all that it wanted, whether the last results are in the journal or not.
+        let kept = runner.close_journal();
+        outcome.map_err(|cause| kept.err().unwrap_or(cause))?;
         let tasks: Vec<TaskSummary> = runner.states.iter().map(TaskState::summary).collect();
         Ok(RunSummary {
             jobs: tasks.iter().map(|task| task.jobs).sum(),
+            journalled: runner.journalled,
             replanned: runner.progress.borrow().replanned.saturating_sub(replanned_before),
             device_time: tasks.iter().map(|task| task.device_time).sum(),
             uploaded_bytes: runner.store.served_bytes() - uploaded_before,
@@ -224,12 +245,13 @@ impl Runner {
         loop {
             self.start_ready_tasks()?;
             let dispatched = self.dispatch_batch()?;
+            let replayed = self.replay()?;
             self.finish_idle_tasks()?;
             if self.states.iter().all(|state| matches!(state.stage, Stage::Done)) {
                 return Ok(());
             }
             // A task that could still be started or has just been dispatched does not wait for an event.
-            self.handle_events(if dispatched { Wait::No } else { Wait::ForOne })?;
+            self.handle_events(if dispatched || replayed { Wait::No } else { Wait::ForOne })?;
         }
     }
 
@@ -360,12 +382,14 @@ impl Runner {
         let state = &mut self.states[at];
         let Stage::Active(active) = &mut state.stage else { return Ok(false) };
         let mut batch = Batch::default();
+        let mut dispatched_any = false;
         while batch.jobs.len() < BATCH_JOBS && batch.program_bytes < BATCH_BYTES {
             let count =
                 self.window.admits(active.pending.len()).min(CHUNK_JOBS).min(BATCH_JOBS - batch.jobs.len());
             if count == 0 {
                 break;
             }
+            dispatched_any = true;
             let mut jobs: Vec<Box<dyn Job>> = active.pending.drain(..count).collect();
             let first = active.next_index;
             let index = |offset: usize| {
@@ -376,22 +400,25 @@ impl Runner {
                 .map_err(|(offset, fault)| fault.into_error(&state.name, index(offset)))?;
             self.dispatch_time = chunk.time_each;
             active.next_index = index(count).0;
-            let mut program_bytes = 0;
-            for (offset, (job, dispatched)) in jobs.into_iter().zip(&chunk.jobs).enumerate() {
-                let size_bytes = dispatched.program.len();
-                program_bytes += size_bytes;
-                active.outstanding.insert(index(offset), Outstanding { job, program_bytes: size_bytes });
+            self.window.dispatched(count, chunk.jobs.iter().map(|job| job.program.len()).sum());
+            for (offset, (job, dispatched)) in jobs.into_iter().zip(chunk.jobs).enumerate() {
+                let (index, program_bytes) = (index(offset), dispatched.program.len());
+                let journal = self.journal.as_mut();
+                let (program, place) =
+                    Self::find_in_journal(journal, &state.name, index, &dispatched.program)?;
+                active.outstanding.insert(index, Outstanding { job, program_bytes, program });
+                match place {
+                    Some(place) => self.replays.push_back(Replay { at, index, place }),
+                    None => batch.add(index, dispatched, active.needs),
+                }
             }
-            self.window.dispatched(count, program_bytes);
-            batch.add(first, chunk.jobs, active.needs, program_bytes);
         }
-        if batch.jobs.is_empty() {
-            return Ok(false);
+        if !batch.jobs.is_empty() {
+            let Batch { jobs, programs, needs, .. } = batch;
+            let needs = needs.expect("a batch of jobs has needs");
+            self.driver.submit(Submission { task, jobs, programs, needs })?;
         }
-        let Batch { jobs, programs, needs, .. } = batch;
-        let needs = needs.expect("a batch of jobs has needs");
-        self.driver.submit(Submission { task, jobs, programs, needs })?;
-        Ok(true)
+        Ok(dispatched_any)
     }
 
     /// Lets tasks end that have no job left and make no more.
@@ -453,20 +480,17 @@ impl Runner {
     fn handle_arrival(&mut self, arrival: Arrival) -> Result<Duration, FarmError> {
         let id = arrival.job();
         let at = (id.task.0.checked_sub(self.tasks.start)).map_or(usize::MAX, |at| at as usize);
-        let state = self.states.get_mut(at).expect("the driver sends a run the jobs of its tasks");
-        let Stage::Active(active) = &mut state.stage else {
-            panic!("{id} ended, but its task has no job outstanding")
-        };
-        let mut ended =
-            active.outstanding.remove(&id.index).expect("a job ends once, after it was dispatched");
-        self.window.retrieved(ended.program_bytes);
-        active.ask = true;
+        let mut ended = self.take_out(at, id.index);
+        let state = &mut self.states[at];
         match arrival {
             Arrival::Delivered { job: _, payload, sections, device_time, node } => {
-                let Payload { bytes, permit } = payload;
+                let bytes = payload.bytes.clone();
                 let result = JobResult { sections: split_sections(bytes, &sections), device_time, node };
                 retrieve(ended.job.as_mut(), result, &state.name, id.index)?;
-                drop(permit);
+                if let (Some(journal), Some(program)) = (&self.journal, ended.program) {
+                    let about = About { task: id.task, name: &state.name, index: id.index, program };
+                    journal.writer.keep(Keep::new(about, sections, device_time, node, payload));
+                }
                 state.progress.jobs_done += 1;
                 state.progress.device_time += device_time;
                 Ok(device_time)
@@ -481,6 +505,18 @@ impl Runner {
                 Err(FarmError::JobFailed { task, job: id.index, failure })
             }
         }
+    }
+
+    /// A job has ended: the window has room, and its task may know of more.
+    fn take_out(&mut self, at: usize, index: JobIndex) -> Outstanding {
+        let state = self.states.get_mut(at).expect("the driver sends a run the jobs of its tasks");
+        let Stage::Active(active) = &mut state.stage else {
+            panic!("{index} of `{}` ended, but the task has no job outstanding", state.name)
+        };
+        let ended = active.outstanding.remove(&index).expect("a job ends once, after it was dispatched");
+        self.window.retrieved(ended.program_bytes);
+        active.ask = true;
+        ended
     }
 
     fn ended(&self, end: RunEnd) -> FarmError {
@@ -510,6 +546,8 @@ impl Runner {
 
 impl Drop for Runner {
     fn drop(&mut self) {
+        // Whoever sees that no task is active may open the journal. Why it failed, if it did, nobody asks any more.
+        let _ = self.close_journal();
         self.no_longer_active(0..self.states.len());
         self.driver.run_over(self.tasks.clone());
     }
@@ -549,17 +587,12 @@ struct Batch {
 }
 
 impl Batch {
-    fn add(&mut self, first: u32, chunk: Vec<Dispatched>, task_needs: Requirements, program_bytes: usize) {
-        self.needs = Some(needs_of_batch(self.needs.unwrap_or(task_needs), &chunk));
-        self.program_bytes += program_bytes;
-        self.jobs.reserve(chunk.len());
-        self.programs.reserve(chunk.len());
-        for (index, job) in (first..).zip(chunk) {
-            let Dispatched { program, contents, module, cost, class, priority, .. } = job;
-            let index = JobIndex(index);
-            self.jobs.push(SubmittedJob { index, cost, class, priority, contents, module });
-            self.programs.push(program);
-        }
+    fn add(&mut self, index: JobIndex, job: Dispatched, task_needs: Requirements) {
+        self.needs = Some(needs_with(self.needs.unwrap_or(task_needs), &job));
+        self.program_bytes += job.program.len();
+        let Dispatched { program, contents, module, cost, class, priority, .. } = job;
+        self.jobs.push(SubmittedJob { index, cost, class, priority, contents, module });
+        self.programs.push(program);
     }
 }
 
@@ -588,13 +621,4 @@ fn application_outcome<T>(
     outcome
         .map_err(|message| FarmError::Panicked { task: name.to_owned(), stage, message })?
         .map_err(|error| FarmError::Task { task: name.to_owned(), stage, error })
-}
-
-/// Cuts a payload into its sections; no bytes are copied. The driver has checked that the lengths add up.
-fn split_sections(mut payload: Bytes, sections: &[u64]) -> Vec<Bytes> {
-    let cut = |length: &u64| {
-        let length = usize::try_from(*length).expect("a section is a part of a payload in memory");
-        payload.split_to(length)
-    };
-    sections.iter().map(cut).collect()
 }

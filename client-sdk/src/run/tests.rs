@@ -9,10 +9,11 @@ use farm_core::{
     id::{AppId, ContentHash},
     program::{DispatchError, JobProgram},
 };
+use proto::codec::content_hash;
 use tokio::sync::mpsc as tokio_mpsc;
 
 use super::*;
-use crate::{driver::Input, graph::TaskGraph, job::RetrieveError, task::TaskError};
+use crate::{driver::Input, graph::TaskGraph, job::RetrieveError, journal::JournalError, task::TaskError};
 
 type Log = Arc<Mutex<Vec<String>>>;
 
@@ -108,15 +109,26 @@ impl Task for NotedTask {
     }
 }
 
+fn payload(bytes: &[u8]) -> Payload {
+    let bytes = Bytes::copy_from_slice(bytes);
+    Payload { digest: content_hash(&bytes), bytes, permit: None }
+}
+
 struct FakeDriver {
     inputs: tokio_mpsc::Receiver<Input>,
     events: mpsc::Sender<RunEvent>,
     run: JoinHandle<Result<RunSummary, FarmError>>,
     progress: watch::Receiver<Progress>,
     store: ContentStore,
+    /// Jobs that the run says are in its journal.
+    kept: usize,
 }
 
 fn start(graph: TaskGraph, window: Window) -> FakeDriver {
+    start_with(graph, window, None)
+}
+
+fn start_with(graph: TaskGraph, window: Window, journal: Option<Journal>) -> FakeDriver {
     let nodes = graph.check().unwrap();
     let (driver, inputs) = DriverHandle::new();
     let (events_sender, events) = mpsc::channel();
@@ -128,6 +140,7 @@ fn start(graph: TaskGraph, window: Window) -> FakeDriver {
         tasks,
         nodes,
         window,
+        journal,
         store: store.clone(),
         driver,
         progress,
@@ -135,26 +148,29 @@ fn start(graph: TaskGraph, window: Window) -> FakeDriver {
         events_sender: events_sender.clone(),
     };
     let run = thread::spawn(move || run.run());
-    FakeDriver { inputs, events: events_sender, run, progress: progress_receiver, store }
+    FakeDriver { inputs, events: events_sender, run, progress: progress_receiver, store, kept: 0 }
 }
 
 impl FakeDriver {
     /// The next batch; `None` when the run is over.
     fn batch(&mut self) -> Option<Submission> {
-        match self.inputs.blocking_recv()? {
-            Input::Submitted(submission) => {
-                assert_eq!(submission.jobs.len(), submission.programs.len());
-                Some(submission)
+        loop {
+            match self.inputs.blocking_recv()? {
+                Input::Submitted(submission) => {
+                    assert_eq!(submission.jobs.len(), submission.programs.len());
+                    return Some(submission);
+                }
+                Input::Kept(jobs) => self.kept += jobs.len(),
+                Input::RunOver { .. } => return None,
+                _ => panic!("a run submits and ends, nothing else"),
             }
-            Input::RunOver { .. } => None,
-            _ => panic!("a run submits and ends, nothing else"),
         }
     }
 
     fn answer(&self, task: TaskId, jobs: &[SubmittedJob]) {
         let arrival = |job: &SubmittedJob| Arrival::Delivered {
             job: JobId { app: AppId(1), task, index: job.index },
-            payload: Payload { bytes: Bytes::copy_from_slice(&job.index.0.to_le_bytes()), permit: None },
+            payload: payload(&job.index.0.to_le_bytes()),
             sections: vec![4],
             device_time: Duration::from_millis(2),
             node: NodeId(1),
@@ -322,4 +338,108 @@ fn stopping_does_not_wait_for_a_preparation() {
     driver.events.send(RunEvent::Ended(RunEnd::Stopped)).unwrap();
     assert!(matches!(driver.end(), Err(FarmError::Stopped { .. })));
     drop(let_go);
+}
+
+/// A journal in a folder of its own.
+struct JournalFile(tempfile::TempDir);
+
+impl JournalFile {
+    fn new() -> Self {
+        Self(tempfile::tempdir().unwrap())
+    }
+
+    fn open(&self) -> Journal {
+        Journal::open(self.0.path().join("journal"), "test").unwrap()
+    }
+}
+
+/// Two tasks, the first with a chain of jobs that follow from results.
+fn journalled_graph(log: &Log) -> TaskGraph {
+    let chain = NotedTask { chain: 3, ..noted(log, "a", 5) };
+    TaskGraph::new().task("a", chain).task("b", noted(log, "b", 10)).after("b", "a")
+}
+
+#[test]
+fn a_run_goes_on_from_its_journal_wherever_it_was_stopped() {
+    for stop_after in 0..=18 {
+        let file = JournalFile::new();
+        let log = Log::default();
+        let mut first = start_with(journalled_graph(&log), Window::default(), Some(file.open()));
+        let mut given = 0;
+        while given < stop_after {
+            let batch = first.batch().expect("jobs are left");
+            let some = batch.jobs.len().min(stop_after - given);
+            first.answer(batch.task, &batch.jobs[..some]);
+            given += some;
+        }
+        first.events.send(RunEvent::Ended(RunEnd::Stopped)).unwrap();
+        while first.batch().is_some() {}
+        let kept = first.kept;
+        let _ = first.end();
+        let got = |log: &Log| log.lock().unwrap().iter().filter(|line| line.contains("got")).count();
+        assert_eq!((got(&log), kept), (stop_after, stop_after), "all that was retrieved is kept");
+        assert_eq!(file.open().results(), stop_after as u64);
+
+        let log = Log::default();
+        let mut second = start_with(journalled_graph(&log), Window::default(), Some(file.open()));
+        let mut computed = 0;
+        while let Some(batch) = second.batch() {
+            computed += batch.jobs.len();
+            second.answer(batch.task, &batch.jobs);
+        }
+        let progress = second.progress.clone();
+        let summary = second.end().unwrap();
+        assert_eq!(computed, 18 - stop_after, "stopped after {stop_after}");
+        assert_eq!((summary.jobs, summary.journalled), (18, stop_after as u64));
+        assert_eq!(summary.device_time, Duration::from_millis(36), "what it took then counts");
+        assert_eq!(progress.borrow().jobs_journalled, stop_after as u64);
+        let mut lines: Vec<String> = log.lock().unwrap().clone();
+        assert_eq!(got(&log), 18, "each job is retrieved once in each process");
+        lines.sort();
+        lines.dedup();
+        assert_eq!(lines.len(), 18 + 4, "and each task prepared and finished: {lines:?}");
+    }
+}
+
+#[test]
+fn a_complete_journal_needs_no_farm() {
+    let file = JournalFile::new();
+    start_with(journalled_graph(&Log::default()), Window::default(), Some(file.open())).serve().unwrap();
+    let log = Log::default();
+    // A window of one: results of the journal take a job's place in it.
+    let window = Window { jobs: 1, ..Window::default() };
+    let mut again = start_with(journalled_graph(&log), window, Some(file.open()));
+    assert!(again.batch().is_none(), "nothing is to be planned");
+    assert_eq!(again.end().unwrap().journalled, 18);
+}
+
+#[test]
+fn a_journal_without_room_ends_the_run() {
+    let file = JournalFile::new();
+    let journal = file.open().with_max_bytes(520);
+    let mut driver = start_with(journalled_graph(&Log::default()), Window::default(), Some(journal));
+    let batch = driver.batch().expect("the task has jobs");
+    // One is left out: the run cannot be complete before it hears.
+    driver.answer(batch.task, &batch.jobs[..4]);
+    assert!(driver.batch().is_none());
+    let error = driver.end().unwrap_err();
+    assert!(matches!(error, FarmError::Journal(JournalError::Full { .. })), "{error}");
+    assert_eq!(file.open().results(), 3, "what found room is kept");
+}
+
+#[test]
+fn a_journal_of_another_graph_or_of_other_inputs_ends_the_run_before_it_begins() {
+    let file = JournalFile::new();
+    start_with(journalled_graph(&Log::default()), Window::default(), Some(file.open())).serve().unwrap();
+    let log = Log::default();
+    let run = |graph| start_with(graph, Window::default(), Some(file.open())).serve().unwrap_err();
+    let error = run(TaskGraph::new().task("a", noted(&log, "a", 5)));
+    assert!(
+        matches!(&error, FarmError::Journal(JournalError::OtherTasks { task, .. }) if task == "b"),
+        "{error}"
+    );
+    let changed = NotedTask { data: Some(b"new data"), ..noted(&log, "a", 5) };
+    let error = run(TaskGraph::new().task("a", changed).task("b", noted(&log, "b", 10)).after("b", "a"));
+    assert!(matches!(error, FarmError::Journal(JournalError::OtherInputs { .. })), "{error}");
+    assert_eq!(*log.lock().unwrap(), ["a prepare"], "no result of the other run was taken");
 }

@@ -11,8 +11,12 @@ impl Ledger {
         self.check_counts();
         self.check_places();
         self.check_batches();
+        self.check_unkept();
         if self.session == Session::Finished {
-            let empty = self.jobs.is_empty() && self.nodes.is_empty() && self.batches.is_empty();
+            let empty = self.jobs.is_empty()
+                && self.nodes.is_empty()
+                && self.batches.is_empty()
+                && self.unkept.is_empty();
             assert!(empty && self.deadlines.is_empty(), "I8: something is kept after goodbye");
         }
     }

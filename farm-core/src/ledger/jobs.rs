@@ -107,15 +107,24 @@ impl Ledger {
     /// A result's way: the current attempt from the planned node is delivered, anything else is acknowledged (so
     /// that the node frees it) and dropped.
     pub(super) fn result(&mut self, life: NodeLife, header: ResultHeader) {
+        if self.waits_to_be_kept(&header) {
+            self.push(Effect::DropPayload { job: header.job, digest: header.digest });
+            return;
+        }
         let ResultHeader { job, device: _, device_time_ns, outcome, digest } = header;
         let key = JobKey::of(job.job);
-        self.acknowledge(life, job, digest);
         let placements: Vec<Placement> = match self.jobs.get(&key) {
             Some(known) if self.app() == Some(job.job.app) => known.placements().collect(),
             Some(_) | None => Vec::new(),
         };
         let is_this = |place: &Placement| place.attempt == job.attempt && place.life == life;
-        if !placements.iter().any(is_this) {
+        let counts = placements.iter().any(is_this);
+        if counts && outcome.is_ok() {
+            self.acknowledge_delivered(life, job, digest);
+        } else {
+            self.acknowledge(life, job, digest);
+        }
+        if !counts {
             self.push(Effect::DropPayload { job, digest });
             return;
         }
@@ -146,6 +155,7 @@ impl Ledger {
     }
 
     pub(super) fn cancelled(&mut self, task: TaskId) {
+        self.keep_no_longer(task);
         let keys: Vec<JobKey> = self.jobs.range(JobKey::range_of(task)).map(|(&key, _)| key).collect();
         if keys.is_empty() {
             return;
@@ -162,6 +172,7 @@ impl Ledger {
 
     /// Forgets every placement: the attempts can never be answered.
     pub(super) fn unplace_all(&mut self) {
+        self.unkept.clear();
         let keys: Vec<JobKey> =
             self.jobs.iter().filter(|(_, job)| job.place.is_some()).map(|(&key, _)| key).collect();
         for key in keys {
@@ -179,6 +190,8 @@ impl Ledger {
     }
 
     pub(super) fn drop_open_jobs(&mut self) {
+        self.journalled.clear();
+        self.unkept.clear();
         self.jobs.clear();
         self.batches.clear();
         self.counts.waiting_jobs = 0;

@@ -3,10 +3,12 @@
 //! It decides which attempt of a job counts, gives each job to the application exactly once, and says what to send
 //! where. Programs and results are its driver's, by [`JobId`]. It never chooses a node: plans are the coordinator's.
 //!
-//! `jobs` owns what is open and what is over, `session` the talk with the coordinator, `nodes` the data links.
+//! `jobs` owns what is open and what is over, `session` the talk with the coordinator, `nodes` the data links, `kept` the
+//! acknowledgements that wait for a journal.
 
 mod invariants;
 mod jobs;
+mod kept;
 mod nodes;
 mod session;
 
@@ -14,6 +16,7 @@ use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
 use self::{
     jobs::{Batch, Job},
+    kept::Unkept,
     nodes::{Node, NodeLife},
     session::{Identity, Session},
 };
@@ -53,6 +56,16 @@ pub struct SubmittedJob {
 pub enum Event {
     /// The driver has a connection to the coordinator: say hello on it.
     CoordinatorConnected,
+    /// Results of this task are acknowledged when [`Event::Kept`] says so, not when they come: their nodes keep them until a crash
+    /// of the application cannot lose them. Comes before the task's jobs; ends with [`Event::Cancelled`].
+    Journalled(TaskId),
+    /// A delivered result of such a task is where a crash of the application does not reach.
+    Kept {
+        /// The task.
+        task: TaskId,
+        /// The job.
+        index: JobIndex,
+    },
     /// The coordinator said something.
     FromCoordinator(CoordinatorToApp),
     /// The connection to the coordinator is gone; the driver will try again.
@@ -89,7 +102,7 @@ pub enum Event {
         /// What. A result's payload is the driver's, who has checked it against the header's digest.
         message: NodeToApp,
     },
-    /// The application gives a task up: each of its open jobs ends with [`Effect::Fail`] of `Cancelled`.
+    /// The application gives a task up, or is through with it: each of its open jobs ends with [`Effect::Fail`] of `Cancelled`.
     Cancelled(TaskId),
     /// The application is done: say goodbye. Open jobs are dropped without a further word; later events are ignored.
     Finished,
@@ -194,6 +207,10 @@ pub struct Ledger {
     jobs: BTreeMap<JobKey, Job>,
     /// Jobs that were delivered or failed: nothing more may come of them.
     over: BTreeSet<JobKey>,
+    /// Tasks whose results are acknowledged when they are kept.
+    journalled: BTreeSet<TaskId>,
+    /// Their delivered results that are not.
+    unkept: BTreeMap<JobKey, Unkept>,
     /// Batches with open jobs.
     batches: BTreeMap<BatchId, Batch>,
     /// Batches to be asked for, in order of submission.
@@ -224,6 +241,8 @@ impl Ledger {
             heartbeat_sequence: 0,
             jobs: BTreeMap::new(),
             over: BTreeSet::new(),
+            journalled: BTreeSet::new(),
+            unkept: BTreeMap::new(),
             batches: BTreeMap::new(),
             to_request: VecDeque::new(),
             requested_jobs: 0,
@@ -263,6 +282,8 @@ impl Ledger {
             Event::CoordinatorConnected => self.coordinator_connected(),
             Event::FromCoordinator(message) => self.coordinator_said(now, message),
             Event::CoordinatorLost => self.coordinator_lost(),
+            Event::Journalled(task) => self.journalled(task),
+            Event::Kept { task, index } => self.kept(JobKey { task, index }),
             Event::Submitted { task, jobs, needs } => self.submitted(task, jobs, needs),
             Event::NodeConnected { node, session } => self.node_connected(now, NodeLife { node, session }),
             Event::NodeLost { node, session } => self.node_lost(now, NodeLife { node, session }),

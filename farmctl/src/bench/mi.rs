@@ -8,7 +8,7 @@ use client_sdk::{RunSummary, SimulatedDevices};
 use mi_kernel::{
     Alignment, Seed,
     generate::RandomAlignment,
-    job::{MiOptions, Mode, mi_graph},
+    job::{JobLengths, MiOptions, Mode, mi_graph},
     parse,
 };
 
@@ -156,6 +156,7 @@ async fn run(
         iterations,
         seed: Seed(setup.seed),
         mode: Mode::Reduce,
+        lengths: JobLengths::Measured,
         earlier: None,
         simulated: SimulatedDevices::Accepted,
     };

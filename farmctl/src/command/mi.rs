@@ -12,7 +12,7 @@ use anyhow::{Context as _, anyhow};
 use client_sdk::{FarmError, FarmOptions, Progress, RunSummary, SimulatedDevices};
 use mi_kernel::{
     Accumulators, Alignment, Filters, GapMode, NullModel, Reference, Seed, ShuffleKind, histogram,
-    job::{MiHandle, MiOptions, Mode, mi_graph},
+    job::{JobLengths, MiHandle, MiOptions, Mode, mi_graph},
     output, parse, saved,
 };
 use serde_json::json;
@@ -22,7 +22,8 @@ use crate::{
     cli::{Gaps, MiArgs, MiMode, ProgressStyle},
     embedded::EmbeddedFarm,
     failure::Failure,
-    output::{moved, print_text},
+    journal,
+    output::{moved, print_text, taken_over},
     progress::{Early, Units},
     running::{Stops, run_graph},
     target::Target,
@@ -63,6 +64,7 @@ pub(crate) async fn run(arguments: &MiArgs, target: &Target<'_>) -> Result<(), F
             MiMode::Reduce => Mode::Reduce,
             MiMode::Matrix => Mode::Matrix,
         },
+        lengths: if arguments.resume { JobLengths::Fixed } else { JobLengths::Measured },
         earlier: input.earlier.clone(),
         simulated: SimulatedDevices::Refused,
     };
@@ -70,6 +72,15 @@ pub(crate) async fn run(arguments: &MiArgs, target: &Target<'_>) -> Result<(), F
     let asked = arguments.iterations.saturating_sub(before);
     let (graph, handle) =
         mi_graph(Arc::clone(&input.alignment), options).with_context(|| shown(&arguments.alignment))?;
+    let path = journal_path(arguments);
+    let journal = if arguments.resume {
+        let MiArgs { iterations, seed, mode, gaps, .. } = arguments;
+        let label = format!("mi, {iterations} iterations, seed {seed}, {mode:?}, {gaps:?}").to_lowercase();
+        Some(journal::open(&path, &label)?)
+    } else {
+        journal::mention(&path);
+        None
+    };
     let (reach, own_farm) = tokio::select! {
         farm = EmbeddedFarm::unless_named(target, &arguments.devices) => farm?,
         () = stops.recv() => return Err(anyhow!("interrupted before the first job: nothing was written").into()),
@@ -86,8 +97,14 @@ pub(crate) async fn run(arguments: &MiArgs, target: &Target<'_>) -> Result<(), F
         policy: arguments.policy.clone(),
         ..reach.options(format!("mi {}", name.to_string_lossy()))
     };
-    let result = run_graph(farm, graph, arguments.progress, units, &mut stops).await;
+    let result = run_graph(farm, graph, journal, arguments.progress, units, &mut stops).await;
+    let of_journal = matches!(result, Err(FarmError::Journal(_)));
     let ended = finish(result, &input, &handle, arguments, before).await;
+    match &ended {
+        Ok(()) if arguments.resume => journal::remove(&path),
+        Err(_) if arguments.resume && !of_journal => journal::tell_kept(&path),
+        Ok(()) | Err(_) => {}
+    }
     if let Some(farm) = own_farm {
         tokio::select! {
             () = farm.stop() => {}
@@ -101,6 +118,11 @@ pub(crate) async fn run(arguments: &MiArgs, target: &Target<'_>) -> Result<(), F
 #[expect(clippy::cast_precision_loss, reason = "a share for people")]
 fn done_of(handle: MiHandle, before: u64, asked: u64) -> Arc<dyn Fn(&Progress) -> f64 + Send + Sync> {
     Arc::new(move |_| (handle.iterations_done() - before) as f64 / asked.max(1) as f64)
+}
+
+/// Where results of jobs are kept while it computes.
+fn journal_path(arguments: &MiArgs) -> PathBuf {
+    arguments.folder.join(journal::EXTENSION)
 }
 
 /// The pair that leads while the run goes on.
@@ -151,6 +173,8 @@ fn read(arguments: &MiArgs) -> Result<Input, Failure> {
     drop(NamedTempFile::new_in(&arguments.folder).with_context(|| shown(&arguments.folder))?);
     let path = arguments.folder.join(SUMS);
     let earlier = match (fs::read(&path), arguments.extend) {
+        // Written by the run that the journal is of, which ended before it could remove it: the same sums will follow.
+        (Ok(_), false) if arguments.resume && journal_path(arguments).exists() => None,
         (Ok(_), false) => {
             let reason = anyhow!(
                 "{} is there already: --extend goes on from it, another folder begins anew",
@@ -197,6 +221,8 @@ async fn finish(
 ) -> Result<(), Failure> {
     let (summary, failure) = match result {
         Ok(summary) => (summary, None),
+        // With a journal half the sums would only be in the way of the whole ones.
+        Err(error) if arguments.resume => return Err(Failure::of_run(error)),
         Err(error) => (RunSummary::default(), Some(Failure::of_run(error))),
     };
     let sums = handle.sums();
@@ -240,6 +266,7 @@ async fn finish(
         "version": env!("CARGO_PKG_VERSION"),
         "nodes": handle.nodes().iter().map(ToString::to_string).collect::<Vec<_>>(),
         "jobs": summary.jobs,
+        "jobs_journalled": summary.journalled,
         "replanned": summary.replanned,
         "wall_seconds": summary.wall_time.as_secs_f64(),
         "device_seconds": summary.device_time.as_secs_f64(),
@@ -281,6 +308,7 @@ fn tell(summary: &RunSummary, arguments: &MiArgs, added: u64, best: &str) -> Res
             "iterations": arguments.iterations,
             "iterations_added": added,
             "jobs": summary.jobs,
+            "jobs_journalled": summary.journalled,
             "replanned": summary.replanned,
             "seconds": seconds,
             "device_seconds": summary.device_time.as_secs_f64(),
@@ -288,9 +316,10 @@ fn tell(summary: &RunSummary, arguments: &MiArgs, added: u64, best: &str) -> Res
         print_text(&format!("{line}\n"))?;
     }
     tell!(
-        "farmctl: {} written: {added} iterations in {} jobs, {seconds:.1} s{}; {best}",
+        "farmctl: {} written: {added} iterations in {} jobs{}, {seconds:.1} s{}; {best}",
         shown(&arguments.folder),
         summary.jobs,
+        taken_over(summary.journalled),
         moved(summary.replanned),
     );
     Ok(())

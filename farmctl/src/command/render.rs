@@ -1,6 +1,10 @@
 //! `farmctl render`: a scene folder in, images out, through a farm.
 
-use std::{path::Path, sync::Arc, time::Duration};
+use std::{
+    path::{Path, PathBuf},
+    sync::Arc,
+    time::Duration,
+};
 
 use anyhow::{Context as _, anyhow};
 use bdpt_kernel::{
@@ -16,7 +20,8 @@ use crate::{
     cli::{ProgressStyle, RenderArgs},
     embedded::EmbeddedFarm,
     failure::Failure,
-    output::{moved, print_text},
+    journal,
+    output::{moved, print_text, taken_over},
     progress::Units,
     running::{Stops, run_graph},
     target::Target,
@@ -44,6 +49,17 @@ pub(crate) async fn run(arguments: &RenderArgs, target: &Target<'_>) -> Result<(
     let (graph, render) =
         render_graph(loaded.scene, RenderOptions::new(size, arguments.spp, arguments.seed))?;
 
+    let path = journal_path(&arguments.images[0]);
+    let journal = if arguments.resume {
+        let FilmSize { width_px, height_px } = size;
+        let label =
+            format!("render, {width_px}x{height_px} px, {} spp, seed {}", arguments.spp, arguments.seed);
+        Some(journal::open(&path, &label)?)
+    } else {
+        journal::mention(&path);
+        None
+    };
+
     let (reach, own_farm) = tokio::select! {
         farm = EmbeddedFarm::unless_named(target, &arguments.devices) => farm?,
         () = stops.recv() => return Err(anyhow!("interrupted before rendering: no image was written").into()),
@@ -63,8 +79,14 @@ pub(crate) async fn run(arguments: &RenderArgs, target: &Target<'_>) -> Result<(
         // Nobody else will join: a device that does not fit now never will.
         farm.patience = OWN_FARM_PATIENCE;
     }
-    let result = run_graph(farm, graph, arguments.progress, units, &mut stops).await;
+    let result = run_graph(farm, graph, journal, arguments.progress, units, &mut stops).await;
+    let of_journal = matches!(result, Err(FarmError::Journal(_)));
     let ended = finish(result, &render, arguments).await;
+    match &ended {
+        Ok(()) if arguments.resume => journal::remove(&path),
+        Err(_) if arguments.resume && !of_journal => journal::tell_kept(&path),
+        Ok(()) | Err(_) => {}
+    }
     if let Some(farm) = own_farm {
         tokio::select! {
             () = farm.stop() => {}
@@ -136,8 +158,13 @@ fn tell_summary(summary: &RunSummary, render: &RenderHandle, arguments: &RenderA
     }
     let prepare: Duration = summary.tasks.iter().map(|task| task.prepare_time).sum();
     let seconds = summary.wall_time.saturating_sub(prepare).as_secs_f64();
+    // What a journal had took no time; jobs are of much the same size.
     #[expect(clippy::cast_precision_loss, reason = "a rate for people")]
-    let (samples_per_second, rays_per_second) = (film.samples as f64 / seconds, film.rays as f64 / seconds);
+    let rate = |count: u64| {
+        let computed = (summary.jobs - summary.journalled) as f64 / summary.jobs.max(1) as f64;
+        count as f64 * computed / seconds
+    };
+    let (samples_per_second, rays_per_second) = (rate(film.samples), rate(film.rays));
     if arguments.progress == ProgressStyle::Ndjson {
         let line = json!({
             "event": "done",
@@ -145,6 +172,7 @@ fn tell_summary(summary: &RunSummary, render: &RenderHandle, arguments: &RenderA
             "light_paths": film.light_paths,
             "rays": film.rays,
             "jobs": summary.jobs,
+            "jobs_journalled": summary.journalled,
             "replanned": summary.replanned,
             "prepare_seconds": prepare.as_secs_f64(),
             "render_seconds": seconds,
@@ -156,14 +184,23 @@ fn tell_summary(summary: &RunSummary, render: &RenderHandle, arguments: &RenderA
     }
     let images: Vec<String> = arguments.images.iter().map(|path| path.display().to_string()).collect();
     tell!(
-        "farmctl: {} written: {} jobs in {seconds:.1} s, {:.3} M samples/s, {:.2} M rays/s{}",
+        "farmctl: {} written: {} jobs{} in {seconds:.1} s, {:.3} M samples/s, {:.2} M rays/s{}",
         images.join(", "),
         summary.jobs,
+        taken_over(summary.journalled),
         samples_per_second / 1e6,
         rays_per_second / 1e6,
         moved(summary.replanned),
     );
     Ok(())
+}
+
+/// Where results of an image are kept while it is rendered.
+fn journal_path(image: &Path) -> PathBuf {
+    let mut name = image.file_name().unwrap_or(image.as_os_str()).to_owned();
+    name.push(".");
+    name.push(journal::EXTENSION);
+    image.with_file_name(name)
 }
 
 /// What the farm calls this application.

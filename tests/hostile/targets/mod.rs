@@ -72,6 +72,8 @@ pub(crate) const TARGETS: &[Target] = &[
     // The coordinator's state.
     slow("control_store", 150, state::control_store),
     slow("epoch_file", 50, state::epoch_file),
+    // What an application keeps of a run.
+    slow("run_journal", 400, state::run_journal),
     // Scenes.
     Target { bytes_per_byte: 128, ..slow("scene_toml", 400, scene::description) },
     slow("scene_obj", 400, scene::geometry),

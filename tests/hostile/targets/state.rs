@@ -1,4 +1,4 @@
-//! The coordinator's state folder, and folders for decoders of files.
+//! The coordinator's state folder, applications' journals, and folders for decoders of files.
 
 use std::{
     fs::{self, File},
@@ -73,6 +73,28 @@ pub(super) fn epoch_file(bytes: &[u8]) -> Verdict {
     folder.write("epoch", bytes);
     coordinator::check_state(folder.path()).map_err(refused)
 }
+
+/// A run's journal: opened, and what was torn at its end is cut off.
+pub(super) fn run_journal(bytes: &[u8]) -> Verdict {
+    Folder::of_thread(|folder| {
+        folder.with("journal", bytes, |path| {
+            let journal = client_sdk::Journal::open(path, JOURNAL_LABEL).map_err(refused)?;
+            let (results, size) = (journal.results(), journal.bytes());
+            drop(journal);
+            // What was left is sound: the next process finds the same.
+            let again = client_sdk::Journal::open(path, JOURNAL_LABEL).expect("it was opened before");
+            assert_eq!(
+                (again.results(), again.bytes(), again.cut_bytes()),
+                (results, size, 0),
+                "opened again"
+            );
+            Ok(())
+        })
+    })
+}
+
+/// The label of the corpus' journals: any other is refused after the header.
+const JOURNAL_LABEL: &str = "test, seed 7";
 
 /// Bytes with each long run of zeros as an escape: `GLZ`, then the length of the run (`u32`, little-endian).
 pub(crate) fn packed(bytes: &[u8]) -> Vec<u8> {

@@ -221,7 +221,7 @@ fn s08_an_application_dies() {
 }
 
 /// 9, the machines' part: an application is killed at half of its work and comes back as who it was, knowing what was delivered
-/// to it: at most 5 % of its jobs are executed again. The journal that would know it is the simulator's: the SDK has none.
+/// to it: at most 5 % of its jobs are executed again. The SDK's journal knows that, but registers anew (`docs/adr/0014`).
 #[test]
 fn s09_an_application_resumes_with_what_a_journal_would_know() {
     let again = worst(|seed| {
