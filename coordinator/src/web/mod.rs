@@ -29,7 +29,7 @@ pub(crate) struct Listener {
 
 impl Listener {
     pub(crate) fn of(listener: TcpListener) -> Self {
-        Self { address: listener.local_addr(), incoming: Incoming::of(listener) }
+        Self { address: listener.local_addr(), incoming: Incoming::http(listener) }
     }
 }
 

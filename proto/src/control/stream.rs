@@ -5,9 +5,14 @@ use std::{
     net::SocketAddr,
     pin::Pin,
     task::{Context, Poll},
+    time::Duration,
 };
 
-use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
+use tokio::{
+    io::{AsyncRead, AsyncWrite, ReadBuf},
+    sync::OwnedSemaphorePermit,
+    time::{self, Instant, Sleep},
+};
 use tokio_rustls::server::TlsStream;
 use tonic::transport::server::Connected;
 
@@ -24,11 +29,53 @@ pub struct Caller {
     pub member: Option<Member>,
 }
 
-/// An accepted connection.
+/// An accepted connection. It ends with an error where its peer is silent for too long.
 #[derive(Debug)]
 pub struct ControlStream {
     caller: Caller,
     transport: Transport,
+    silence: Silence,
+    /// Of the connections that its listener may have.
+    _place: OwnedSemaphorePermit,
+}
+
+/// How long a peer may be silent from now on.
+#[derive(Debug)]
+pub(super) enum Silence {
+    /// Until it has said as much as makes a connection.
+    Opening { ends: Pin<Box<Sleep>>, missing_bytes: usize },
+    /// Between two bytes in either direction.
+    Idle { ends: Pin<Box<Sleep>>, most: Duration },
+    /// For ever: the protocol's pings find out.
+    Allowed,
+}
+
+impl Silence {
+    pub(super) fn opening(patience: Duration, missing_bytes: usize) -> Self {
+        Self::Opening { ends: Box::pin(time::sleep(patience)), missing_bytes }
+    }
+
+    pub(super) fn idle(most: Duration) -> Self {
+        Self::Idle { ends: Box::pin(time::sleep(most)), most }
+    }
+
+    /// Bytes came, or went.
+    pub(super) fn broken(&mut self, came: usize, went: usize) {
+        match self {
+            Self::Opening { missing_bytes, .. } if came >= *missing_bytes => *self = Self::Allowed,
+            Self::Opening { missing_bytes, .. } => *missing_bytes -= came,
+            Self::Idle { ends, most } if came + went > 0 => ends.as_mut().reset(Instant::now() + *most),
+            Self::Idle { .. } | Self::Allowed => {}
+        }
+    }
+
+    /// An error once it has lasted too long; wakes then.
+    pub(super) fn poll_end(&mut self, context: &mut Context<'_>) -> Poll<io::Result<()>> {
+        let (Self::Opening { ends, .. } | Self::Idle { ends, .. }) = self else { return Poll::Pending };
+        ends.as_mut()
+            .poll(context)
+            .map(|()| Err(io::Error::new(io::ErrorKind::TimedOut, "the peer is silent")))
+    }
 }
 
 #[derive(Debug)]
@@ -38,15 +85,34 @@ enum Transport {
 }
 
 impl ControlStream {
-    pub(super) fn plain(stream: TcpStream, address: SocketAddr) -> Self {
+    pub(super) fn plain(
+        stream: TcpStream,
+        address: SocketAddr,
+        silence: Silence,
+        place: OwnedSemaphorePermit,
+    ) -> Self {
         let caller = Caller { address, encrypted: false, member: None };
-        Self { caller, transport: Transport::Plain(stream) }
+        Self { caller, transport: Transport::Plain(stream), silence, _place: place }
     }
 
-    pub(super) fn tls(stream: TlsStream<TcpStream>, address: SocketAddr) -> Self {
+    pub(super) fn tls(
+        stream: TlsStream<TcpStream>,
+        address: SocketAddr,
+        silence: Silence,
+        place: OwnedSemaphorePermit,
+    ) -> Self {
         let member = tls::member(stream.get_ref().1.peer_certificates());
         let caller = Caller { address, encrypted: true, member };
-        Self { caller, transport: Transport::Tls(Box::new(stream)) }
+        Self { caller, transport: Transport::Tls(Box::new(stream)), silence, _place: place }
+    }
+}
+
+impl ControlStream {
+    fn wrote(&mut self, written: Poll<io::Result<usize>>) -> Poll<io::Result<usize>> {
+        if let Poll::Ready(Ok(bytes)) = &written {
+            self.silence.broken(0, *bytes);
+        }
+        written
     }
 }
 
@@ -64,10 +130,16 @@ impl AsyncRead for ControlStream {
         context: &mut Context<'_>,
         buffer: &mut ReadBuf<'_>,
     ) -> Poll<io::Result<()>> {
-        match &mut self.transport {
+        let before = buffer.filled().len();
+        let read = match &mut self.transport {
             Transport::Plain(stream) => Pin::new(stream).poll_read(context, buffer),
             Transport::Tls(stream) => Pin::new(stream).poll_read(context, buffer),
+        };
+        if read.is_pending() {
+            return self.silence.poll_end(context);
         }
+        self.silence.broken(buffer.filled().len() - before, 0);
+        read
     }
 }
 
@@ -77,10 +149,11 @@ impl AsyncWrite for ControlStream {
         context: &mut Context<'_>,
         bytes: &[u8],
     ) -> Poll<io::Result<usize>> {
-        match &mut self.transport {
+        let written = match &mut self.transport {
             Transport::Plain(stream) => Pin::new(stream).poll_write(context, bytes),
             Transport::Tls(stream) => Pin::new(stream).poll_write(context, bytes),
-        }
+        };
+        self.wrote(written)
     }
 
     fn poll_write_vectored(
@@ -88,10 +161,11 @@ impl AsyncWrite for ControlStream {
         context: &mut Context<'_>,
         slices: &[io::IoSlice<'_>],
     ) -> Poll<io::Result<usize>> {
-        match &mut self.transport {
+        let written = match &mut self.transport {
             Transport::Plain(stream) => Pin::new(stream).poll_write_vectored(context, slices),
             Transport::Tls(stream) => Pin::new(stream).poll_write_vectored(context, slices),
-        }
+        };
+        self.wrote(written)
     }
 
     fn is_write_vectored(&self) -> bool {
