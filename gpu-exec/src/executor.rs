@@ -2,7 +2,7 @@
 //!
 //! It owns no device itself: it hands orders to [`crate::real`] or [`crate::sim`].
 
-use std::{sync::Arc, time::Duration};
+use std::{path::PathBuf, sync::Arc, time::Duration};
 
 use bytes::Bytes;
 use farm_core::{
@@ -134,6 +134,8 @@ pub struct ExecutorConfig {
     pub submit_target: Duration,
     /// What becomes of a hung device.
     pub hung_device: HungDevice,
+    /// A folder where what drivers compile is kept for later processes.
+    pub compiled: Option<PathBuf>,
 }
 
 impl Default for ExecutorConfig {
@@ -147,6 +149,7 @@ impl Default for ExecutorConfig {
             // 30-programs-and-data.md section 4: a submit stays below 50 ms; half of it leaves room for variance.
             submit_target: Duration::from_millis(25),
             hung_device: HungDevice::Reopened,
+            compiled: None,
         }
     }
 }

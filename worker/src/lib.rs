@@ -240,8 +240,10 @@ impl Drop for WorkerHandle {
 pub async fn start(options: WorkerOptions) -> Result<WorkerHandle, StartError> {
     let (events_sender, events) = mpsc::unbounded_channel();
     let contents = open_contents(&options).await?;
+    let compiled = options.cache.as_ref().map(|cache| cache.join("pipelines"));
+    let (specs, shelf) = (options.devices.clone(), contents.shelf());
     let opened =
-        executor::open(options.devices.clone(), &options.isolation, contents.shelf(), &events_sender).await?;
+        executor::open(specs, &options.isolation, compiled.as_deref(), shelf, &events_sender).await?;
     let (devices, infos): (_, Vec<DeviceInfo>) = opened.into_iter().unzip();
     let server = Arc::new(DataServer::bind(options.listen, options.identity.as_ref())?);
     let data = server.local_addr();

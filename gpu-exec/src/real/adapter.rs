@@ -61,6 +61,8 @@ pub(crate) struct Gpu {
     pub(crate) limits: wgpu::Limits,
     pub(crate) name: String,
     pub(crate) kind: DeviceKind,
+    /// What the driver compiles here is of use to adapters with the same key; `None` where it is kept nowhere.
+    pub(crate) compiled_key: Option<String>,
     /// Nanoseconds a timestamp tick, where the device has usable timestamps.
     pub(crate) timestamp_period_ns: Option<f64>,
     lost: Arc<AtomicBool>,
@@ -115,7 +117,11 @@ impl Gpu {
         // lavapipe's dispatches leave no time between two timestamps: they are taken where the commands are recorded.
         let timestamps = features.contains(wgpu::Features::TIMESTAMP_QUERY) && kind == DeviceKind::Gpu;
         let timestamp_period_ns = timestamps.then(|| f64::from(queue.get_timestamp_period()));
-        Ok(Self { device, queue, limits, name: info.name, kind, timestamp_period_ns, lost })
+        let compiled_key = features
+            .contains(wgpu::Features::PIPELINE_CACHE)
+            .then(|| wgpu::util::pipeline_cache_key(&info))
+            .flatten();
+        Ok(Self { device, queue, limits, name: info.name, kind, compiled_key, timestamp_period_ns, lost })
     }
 
     /// Whether the driver has given the device up.
@@ -168,7 +174,7 @@ impl Gpu {
     }
 }
 
-/// Abilities that kernels may use, and the timestamps that the executor uses itself.
+/// Abilities that kernels may use, and what the executor uses itself: timestamps and the driver's cache.
 fn wanted_features() -> wgpu::Features {
     wgpu::Features::SHADER_INT64
         | wgpu::Features::SHADER_INT64_ATOMIC_ALL_OPS
@@ -176,6 +182,7 @@ fn wanted_features() -> wgpu::Features {
         | wgpu::Features::SHADER_F16
         | wgpu::Features::SUBGROUP
         | wgpu::Features::TIMESTAMP_QUERY
+        | wgpu::Features::PIPELINE_CACHE
 }
 
 struct Found {

@@ -5,6 +5,7 @@
 
 mod adapter;
 mod clock;
+mod compiled;
 mod memory;
 mod module;
 mod pace;

@@ -10,6 +10,7 @@ use farm_core::{id::ContentHash, message::JobFailure};
 
 use super::{
     adapter::Gpu,
+    compiled::Compiled,
     module::{EntryPoint, Global, GlobalsIn, Module},
     pace::Pace,
 };
@@ -50,6 +51,8 @@ pub(crate) struct PipelineCache {
     max_modules: usize,
     max_pipelines: usize,
     unchecked: bool,
+    /// What the driver compiled, in this process and in earlier ones.
+    compiled: Option<Compiled>,
     clock: u64,
 }
 
@@ -60,13 +63,14 @@ struct Used<T> {
 }
 
 impl PipelineCache {
-    pub(crate) fn new(config: &ExecutorConfig) -> Self {
+    pub(crate) fn new(gpu: &Gpu, config: &ExecutorConfig) -> Self {
         Self {
             modules: HashMap::new(),
             pipelines: HashMap::new(),
             max_modules: config.max_modules.max(1),
             max_pipelines: config.max_pipelines.max(1),
             unchecked: config.unchecked,
+            compiled: config.compiled.as_deref().and_then(|folder| Compiled::open(gpu, folder)),
             clock: 0,
         }
     }
@@ -89,7 +93,11 @@ impl PipelineCache {
             return Ok(Arc::clone(&used.value));
         }
         let compiled = self.module(gpu, module, source)?;
-        let pipeline = Arc::new(compile(gpu, module, compiled, entry, constants)?);
+        let cache = self.compiled.as_ref().map(Compiled::cache);
+        let pipeline = Arc::new(compile(gpu, module, compiled, entry, constants, cache)?);
+        if let Some(compiled) = &self.compiled {
+            compiled.save();
+        }
         make_room(&mut self.pipelines, self.max_pipelines);
         self.pipelines.insert(key, Used { value: Arc::clone(&pipeline), at });
         Ok(pipeline)
@@ -132,6 +140,7 @@ fn compile(
     module: Arc<Module>,
     name: &str,
     constants: &[(String, f64)],
+    cache: Option<&wgpu::PipelineCache>,
 ) -> Result<Pipeline, JobFailure> {
     let invalid = |text: String| JobFailure::InvalidProgram(format!("module {hash:?}: {text}"));
     let Some(entry) = module.entries.get(name).cloned() else {
@@ -166,7 +175,7 @@ fn compile(
                     constants: &values,
                     ..Default::default()
                 },
-                cache: None,
+                cache,
             });
             (layouts, raw)
         })

@@ -33,7 +33,7 @@ impl Caches {
         Self {
             pool: Pool::new(gpu, config),
             allocations: AllocationCache::new(gpu, config),
-            pipelines: PipelineCache::new(config),
+            pipelines: PipelineCache::new(gpu, config),
             slices: SliceTable::default(),
         }
     }

@@ -1,6 +1,6 @@
 //! Programs that work: every command does what its documentation says.
 
-use std::time::Duration;
+use std::{fs, time::Duration};
 
 use farm_core::{
     device::DeviceKind,
@@ -217,6 +217,36 @@ fn slices_of_any_size_cover_each_layer_exactly_once() {
     let slow = TestDevice::with(config);
     for _ in 0..2 {
         assert_eq!(run(&slow, Some(u32::MAX)), expected, "single layers");
+    }
+}
+
+#[test]
+fn what_a_driver_compiled_is_kept_for_later_processes_and_spoilt_files_do_no_harm() {
+    let folder = tempfile::tempdir().unwrap();
+    let compiled = folder.path().join("pipelines");
+    let run = || {
+        let compiled = Some(compiled.clone());
+        let device = TestDevice::with(ExecutorConfig { compiled, ..ExecutorConfig::default() });
+        let (module, module_bytes) = content(INCREMENT.as_bytes());
+        let mut program = JobProgram::default();
+        let values = program.malloc(16).unwrap();
+        let increment = program.function(module, "increment");
+        program.param_in_out(increment, 0, values).unwrap();
+        program.launch(increment, [1, 1, 1]).unwrap();
+        program.memcpy_dtoh(values, 0, 16).unwrap();
+        assert_eq!(as_u32(&device.run_program(program, &[module_bytes]).unwrap()[0]), [1; 4]);
+    };
+    let files = || -> Vec<_> { fs::read_dir(&compiled).unwrap().map(|entry| entry.unwrap().path()).collect() };
+    run();
+    let [file] = &files()[..] else { panic!("one device, one file: {:?}", files()) };
+    let first = fs::read(file).unwrap();
+    run();
+    assert_eq!(files(), [file.clone()]);
+    for spoilt in [&first[..10], &[7; 1_000]] {
+        fs::write(file, spoilt).unwrap();
+        run();
+        assert_eq!(files(), [file.clone()], "it is written anew");
+        assert_ne!(fs::read(file).unwrap(), spoilt);
     }
 }
 

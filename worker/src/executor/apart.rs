@@ -40,6 +40,8 @@ pub(super) struct Launch {
     /// A binary that serves when its first argument is [`super::ROLE`].
     pub(super) program: PathBuf,
     pub(super) spec: DeviceSpec,
+    /// Where what drivers compile is kept.
+    pub(super) compiled: Option<PathBuf>,
 }
 
 /// The way to a device's executor process. Dropping it ends the process.

@@ -1,6 +1,6 @@
 //! A device's executor inside this process: for simulated devices, and for farms inside a test.
 
-use std::{collections::HashSet, sync::Arc};
+use std::{collections::HashSet, path::PathBuf, sync::Arc};
 
 use farm_core::{
     device::DeviceInfo,
@@ -32,6 +32,7 @@ impl InProcess {
     pub(super) fn start(
         spec: DeviceSpec,
         index: DeviceIndex,
+        compiled: Option<PathBuf>,
         contents: Shelf,
         events: mpsc::UnboundedSender<DeviceEvent>,
     ) -> Result<(Self, DeviceInfo), OpenError> {
@@ -40,7 +41,8 @@ impl InProcess {
             // The driver is gone only when the worker ends: nobody is left to hear.
             let _ = told.send(DeviceEvent::of(index, event));
         };
-        let executor = gpu_exec::Executor::start(&spec, ExecutorConfig::default(), host)?;
+        let config = ExecutorConfig { compiled, ..ExecutorConfig::default() };
+        let executor = gpu_exec::Executor::start(&spec, config, host)?;
         let info = executor.info().clone();
         Ok((Self { executor, index, contents, events }, info))
     }

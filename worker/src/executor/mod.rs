@@ -9,7 +9,12 @@ mod restarts;
 mod serve;
 mod wire;
 
-use std::{ffi::OsString, path::PathBuf, process::ExitCode, time::Duration};
+use std::{
+    ffi::OsString,
+    path::{Path, PathBuf},
+    process::ExitCode,
+    time::Duration,
+};
 
 use bytes::Bytes;
 use farm_core::{
@@ -26,7 +31,8 @@ use self::{
 };
 use crate::{StartError, contents::Shelf, device::DeviceEvent};
 
-/// First argument of a binary that is to be an executor process; the second is its device.
+/// First argument of a binary that is to be an executor process; the second is its device, the third, if there is one, the folder
+/// for what drivers compile.
 const ROLE: &str = "executor";
 
 /// Where executors run. Simulated devices run in this process always: no driver of theirs can crash it.
@@ -53,7 +59,7 @@ pub fn serve_if_executor(mut arguments: impl Iterator<Item = OsString>) -> Optio
         return None;
     }
     let spec = arguments.next().unwrap_or_default();
-    Some(serve::serve(&spec.to_string_lossy()))
+    Some(serve::serve(&spec.to_string_lossy(), arguments.next().map(PathBuf::from)))
 }
 
 /// One job for an executor.
@@ -105,6 +111,7 @@ impl Executor {
 pub(crate) async fn open(
     specs: Vec<DeviceSpec>,
     isolation: &Isolation,
+    compiled: Option<&Path>,
     contents: &Shelf,
     events: &mpsc::UnboundedSender<DeviceEvent>,
 ) -> Result<Vec<(Executor, DeviceInfo)>, StartError> {
@@ -112,15 +119,16 @@ pub(crate) async fn open(
     let mut devices = Vec::with_capacity(specs.len());
     for (index, spec) in (0..).map(DeviceIndex).zip(specs) {
         let (contents, events) = (contents.clone(), events.clone());
+        let compiled = compiled.map(Path::to_owned);
         devices.push(match (isolation, spec) {
             (Isolation::Processes(program), DeviceSpec::Gpu(_) | DeviceSpec::Cpu | DeviceSpec::All) => {
-                let launch = Launch { program: program.clone(), spec };
+                let launch = Launch { program: program.clone(), spec, compiled };
                 let started = ExecutorProcess::start(launch, index, contents, events).await;
                 let (process, info) = started.map_err(|reason| StartError::Executor { reason })?;
                 (Executor::Apart(process), info)
             }
             (Isolation::None, _) | (Isolation::Processes(_), DeviceSpec::Sim(_)) => {
-                let open = move || InProcess::start(spec, index, contents, events);
+                let open = move || InProcess::start(spec, index, compiled, contents, events);
                 let (executor, info) = blocking(open).await?;
                 (Executor::Here(executor), info)
             }

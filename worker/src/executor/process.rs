@@ -76,6 +76,7 @@ impl Process {
             .arg0("farm-worker")
             .arg(ROLE)
             .arg(launch.spec.to_string())
+            .args(&launch.compiled)
             .stdin(Stdio::from(OwnedFd::from(theirs)))
             .stdout(Stdio::null())
             // A Ctrl-C at the terminal is for the daemon, which drains.

@@ -6,6 +6,7 @@ use std::{
         fd::AsFd as _,
         unix::{net::UnixStream, process::parent_id},
     },
+    path::PathBuf,
     process::ExitCode,
     sync::{
         Arc, Condvar, Mutex, MutexGuard, PoisonError,
@@ -37,12 +38,12 @@ const PARENT_LOOKS: Duration = Duration::from_secs(1);
 /// Exit code where there is no worker at the other end.
 const EXIT_USAGE: u8 = 2;
 
-/// Opens the device `spec` and runs jobs on it until the worker at the other end of standard input is gone.
-pub(super) fn serve(spec: &str) -> ExitCode {
+/// Opens the device `spec`, with what its driver compiled before from the folder `compiled`, and runs jobs on it until the worker at the other end of standard input is gone.
+pub(super) fn serve(spec: &str, compiled: Option<PathBuf>) -> ExitCode {
     let Ok(socket) = io::stdin().as_fd().try_clone_to_owned().map(UnixStream::from) else {
         return ExitCode::from(EXIT_USAGE);
     };
-    let done = Line::new(socket).and_then(|line| run(spec, &Arc::new(line)));
+    let done = Line::new(socket).and_then(|line| run(spec, compiled, &Arc::new(line)));
     end_soon();
     match done {
         Ok(()) => ExitCode::SUCCESS,
@@ -56,8 +57,8 @@ pub(super) fn serve(spec: &str) -> ExitCode {
     }
 }
 
-fn run(spec: &str, line: &Arc<Line>) -> io::Result<()> {
-    let config = ExecutorConfig { hung_device: HungDevice::Lost, ..ExecutorConfig::default() };
+fn run(spec: &str, compiled: Option<PathBuf>, line: &Arc<Line>) -> io::Result<()> {
+    let config = ExecutorConfig { hung_device: HungDevice::Lost, compiled, ..ExecutorConfig::default() };
     let open = end_with_parent();
     let opened = spec.parse::<DeviceSpec>().map_err(|error| error.to_string()).and_then(|spec| {
         let host = Speaker(Arc::clone(line));
