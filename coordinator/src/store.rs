@@ -9,14 +9,15 @@ use std::{
     ops::Not as _,
     panic::catch_unwind,
     path::{Path, PathBuf},
+    sync::{PoisonError, RwLock},
     time::SystemTime,
 };
 
 use farm_core::id::Epoch;
 use proto::trust::{Member, Membership, Principal, Role, TrustError};
 use redb::{
-    Database, DatabaseError, ReadableDatabase as _, ReadableTable as _, ReadableTableMetadata as _,
-    TableDefinition, TableError,
+    Database, DatabaseError, ReadTransaction, ReadableDatabase as _, ReadableTable as _,
+    ReadableTableMetadata as _, TableDefinition, TableError, WriteTransaction,
 };
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
@@ -97,7 +98,10 @@ pub(crate) fn epoch_by_the_clock() -> Epoch {
 #[derive(Debug)]
 pub(crate) struct Store {
     path: PathBuf,
-    database: Database,
+    /// `None` after the disk failed: redb takes nothing more then (a full disk is enough), and is opened anew.
+    ///
+    /// A lock, not an owner: sessions read side by side, each on a thread that may block. Held for a transaction.
+    database: RwLock<Option<Database>>,
 }
 
 impl Store {
@@ -108,7 +112,7 @@ impl Store {
         // The database asserts, deep inside, what its file's header says: on a file that was cut or changed it panics.
         let opened = catch_unwind(|| Self::open_database(directory, &path));
         let database = opened.unwrap_or_else(|panic| Err(fault(&path, &damage(panic.as_ref()))))?;
-        let store = Self { path, database };
+        let store = Self { path, database: RwLock::new(Some(database)) };
         store.begin(directory)?;
         Ok(store)
     }
@@ -138,23 +142,64 @@ impl Store {
         }
     }
 
+    /// Reads from the state that was committed last.
+    fn read<T>(&self, work: impl FnOnce(&ReadTransaction) -> Result<T, StoreError>) -> Result<T, StoreError> {
+        self.with(|database| work(&database.begin_read().map_err(broken)?))
+    }
+
+    /// Changes something: all that `work` did is on disk when this returns, or nothing of it ever will be.
+    fn write<T>(
+        &self,
+        work: impl FnOnce(&WriteTransaction) -> Result<T, StoreError>,
+    ) -> Result<T, StoreError> {
+        self.with(|database| {
+            let transaction = database.begin_write().map_err(broken)?;
+            let done = work(&transaction)?;
+            transaction.commit().map_err(broken)?;
+            Ok(done)
+        })
+    }
+
+    fn with<T>(&self, work: impl FnOnce(&Database) -> Result<T, StoreError>) -> Result<T, StoreError> {
+        self.open_again()?;
+        let done = {
+            let open = self.database.read().unwrap_or_else(PoisonError::into_inner);
+            work(open.as_ref().ok_or_else(|| StoreError::Broken("it is closed".to_owned()))?)
+        };
+        if let Err(StoreError::Broken(reason)) = &done {
+            tracing::error!(reason, "the control store failed; it is opened anew for what comes next");
+            self.database.write().unwrap_or_else(PoisonError::into_inner).take();
+        }
+        done
+    }
+
+    /// Opens the database, if it failed.
+    fn open_again(&self) -> Result<(), StoreError> {
+        if self.database.read().unwrap_or_else(PoisonError::into_inner).is_some() {
+            return Ok(());
+        }
+        let mut closed = self.database.write().unwrap_or_else(PoisonError::into_inner);
+        if closed.is_none() {
+            let opened = Database::builder().set_cache_size(CACHE_BYTES).create(&self.path);
+            *closed = Some(opened.map_err(broken)?);
+        }
+        Ok(())
+    }
+
     /// Makes the tables, and takes over the epoch of an earlier version.
     fn begin(&self, directory: &Path) -> Result<(), StartError> {
         let earlier = earlier_epoch(directory)?;
-        let write = || {
-            let transaction = self.database.begin_write().map_err(broken)?;
-            {
-                let mut numbers = transaction.open_table(NUMBERS).map_err(broken)?;
-                transaction.open_table(TOKENS).map_err(broken)?;
-                transaction.open_table(MEMBERS).map_err(broken)?;
-                let known = numbers.get(EPOCH).map_err(broken)?.is_some();
-                if let Some(earlier) = earlier.filter(|_| !known) {
-                    numbers.insert(EPOCH, u64::from(earlier)).map_err(broken)?;
-                }
+        let begun = self.write(|transaction| {
+            let mut numbers = transaction.open_table(NUMBERS).map_err(broken)?;
+            transaction.open_table(TOKENS).map_err(broken)?;
+            transaction.open_table(MEMBERS).map_err(broken)?;
+            let known = numbers.get(EPOCH).map_err(broken)?.is_some();
+            if let Some(earlier) = earlier.filter(|_| !known) {
+                numbers.insert(EPOCH, u64::from(earlier)).map_err(broken)?;
             }
-            transaction.commit().map_err(broken)
-        };
-        write().map_err(|error| fault(&self.path, &error))
+            Ok(())
+        });
+        begun.map_err(|error| fault(&self.path, &error))
     }
 
     /// Reads everything once.
@@ -162,10 +207,11 @@ impl Store {
         let read = || {
             self.tokens(0)?;
             self.members()?;
-            let transaction = self.database.begin_read().map_err(broken)?;
-            let numbers = transaction.open_table(NUMBERS).map_err(broken)?;
-            numbers.get(EPOCH).map_err(broken)?;
-            Ok::<_, StoreError>(())
+            self.read(|transaction| {
+                let numbers = transaction.open_table(NUMBERS).map_err(broken)?;
+                numbers.get(EPOCH).map_err(broken)?;
+                Ok::<_, StoreError>(())
+            })
         };
         read().map_err(|error| fault(&self.path, &error))
     }
@@ -178,23 +224,19 @@ impl Store {
 
     /// The next of one of the numbers, from 1.
     fn count(&self, what: &str) -> Result<u64, StoreError> {
-        let transaction = self.database.begin_write().map_err(broken)?;
-        let next = {
+        self.write(|transaction| {
             let mut numbers = transaction.open_table(NUMBERS).map_err(broken)?;
             let last = numbers.get(what).map_err(broken)?.map_or(0, |last| last.value());
             let next = last.saturating_add(1);
             numbers.insert(what, next).map_err(broken)?;
-            next
-        };
-        transaction.commit().map_err(broken)?;
-        Ok(next)
+            Ok(next)
+        })
     }
 
     /// Keeps a token under a number of its own, which it gives; forgets those that are over.
     pub(crate) fn add_token(&self, secret: &[u8], token: Token, now_s: u64) -> Result<u64, StoreError> {
         let id = self.count(LAST_TOKEN)?;
-        let transaction = self.database.begin_write().map_err(broken)?;
-        {
+        self.write(|transaction| {
             let mut tokens = transaction.open_table(TOKENS).map_err(broken)?;
             tokens
                 .retain(|_, text| parse(text).is_ok_and(|token| token.expires_s > now_s))
@@ -206,30 +248,29 @@ impl Store {
             }
             let text = text_of(&Token { id, ..token })?;
             tokens.insert(digest(secret).as_slice(), text.as_str()).map_err(broken)?;
-        }
-        transaction.commit().map_err(broken)?;
-        Ok(id)
+            Ok(id)
+        })
     }
 
     /// The tokens that can be used still, by number.
     pub(crate) fn tokens(&self, now_s: u64) -> Result<Vec<Token>, StoreError> {
-        let transaction = self.database.begin_read().map_err(broken)?;
-        let table = transaction.open_table(TOKENS).map_err(broken)?;
-        let mut tokens = Vec::new();
-        for entry in table.iter().map_err(broken)? {
-            let (_, text) = entry.map_err(broken)?;
-            tokens.push(parse(text.value())?);
-        }
-        tokens.retain(|token: &Token| token.expires_s > now_s);
-        tokens.sort_unstable_by_key(|token| token.id);
-        Ok(tokens)
+        self.read(|transaction| {
+            let table = transaction.open_table(TOKENS).map_err(broken)?;
+            let mut tokens = Vec::new();
+            for entry in table.iter().map_err(broken)? {
+                let (_, text) = entry.map_err(broken)?;
+                tokens.push(parse(text.value())?);
+            }
+            tokens.retain(|token: &Token| token.expires_s > now_s);
+            tokens.sort_unstable_by_key(|token| token.id);
+            Ok(tokens)
+        })
     }
 
     /// Takes a token back; whether it was there.
     pub(crate) fn remove_token(&self, id: u64) -> Result<bool, StoreError> {
-        let transaction = self.database.begin_write().map_err(broken)?;
-        let mut removed = false;
-        {
+        self.write(|transaction| {
+            let mut removed = false;
             let mut tokens = transaction.open_table(TOKENS).map_err(broken)?;
             tokens
                 .retain(|_, text| {
@@ -238,9 +279,8 @@ impl Store {
                     !this
                 })
                 .map_err(broken)?;
-        }
-        transaction.commit().map_err(broken)?;
-        Ok(removed)
+            Ok(removed)
+        })
     }
 
     /// Uses a token once: `issue` makes the membership for role and name, and only if it does is the token used. A name that
@@ -254,8 +294,7 @@ impl Store {
     ) -> Result<Membership, StoreError> {
         // One answer for what never was, is over, was used up or was taken back: strangers learn nothing.
         let unknown = || StoreError::Denied("this token cannot be used (any more)".to_owned());
-        let transaction = self.database.begin_write().map_err(broken)?;
-        let membership = {
+        self.write(|transaction| {
             let mut tokens = transaction.open_table(TOKENS).map_err(broken)?;
             let key = digest(secret);
             let token =
@@ -277,33 +316,32 @@ impl Store {
             } else {
                 tokens.insert(key.as_slice(), text_of(&token)?.as_str()).map_err(broken)?;
             }
-            membership
-        };
-        transaction.commit().map_err(broken)?;
-        Ok(membership)
+            Ok(membership)
+        })
     }
 
     /// Makes somebody a member without a token.
     pub(crate) fn admit(&self, member: &Member) -> Result<(), StoreError> {
-        let transaction = self.database.begin_write().map_err(broken)?;
-        enrol(&mut transaction.open_table(MEMBERS).map_err(broken)?, member, true)?;
-        transaction.commit().map_err(broken)
+        self.write(|transaction| {
+            enrol(&mut transaction.open_table(MEMBERS).map_err(broken)?, member, true)?;
+            Ok(())
+        })
     }
 
     /// Whether somebody is a member under this key.
     pub(crate) fn is_member(&self, member: &Member) -> Result<bool, StoreError> {
-        let transaction = self.database.begin_read().map_err(broken)?;
-        let members = transaction.open_table(MEMBERS).map_err(broken)?;
-        let known = members.get(member.principal.to_string().as_str()).map_err(broken)?;
-        Ok(known.is_some_and(|key| key.value() == member.key))
+        self.read(|transaction| {
+            let members = transaction.open_table(MEMBERS).map_err(broken)?;
+            let known = members.get(member.principal.to_string().as_str()).map_err(broken)?;
+            Ok(known.is_some_and(|key| key.value() == member.key))
+        })
     }
 
     /// Ends a membership, and takes back the tokens that this member has made; whether it was one. Certificates live on, and
     /// are worth nothing here. The last operator stays: nobody else could make another.
     pub(crate) fn expel(&self, principal: &Principal) -> Result<bool, StoreError> {
         let uri = principal.to_string();
-        let transaction = self.database.begin_write().map_err(broken)?;
-        let was = {
+        self.write(|transaction| {
             let mut members = transaction.open_table(MEMBERS).map_err(broken)?;
             let mut operators = 0;
             for entry in members.iter().map_err(broken)? {
@@ -317,10 +355,8 @@ impl Store {
             }
             let mut tokens = transaction.open_table(TOKENS).map_err(broken)?;
             tokens.retain(|_, text| parse(text).is_ok_and(|token| token.maker != uri)).map_err(broken)?;
-            members.remove(uri.as_str()).map_err(broken)?.is_some()
-        };
-        transaction.commit().map_err(broken)?;
-        Ok(was)
+            Ok(members.remove(uri.as_str()).map_err(broken)?.is_some())
+        })
     }
 
     /// Whether the farm that this is the store of was ever secured.
@@ -331,18 +367,21 @@ impl Store {
 
     /// Forgets members and tokens.
     pub(crate) fn clear(&self) -> Result<(), StoreError> {
-        let transaction = self.database.begin_write().map_err(broken)?;
-        transaction.open_table(TOKENS).map_err(broken)?.retain(|_, _| false).map_err(broken)?;
-        transaction.open_table(MEMBERS).map_err(broken)?.retain(|_, _| false).map_err(broken)?;
-        transaction.commit().map_err(broken)
+        self.write(|transaction| {
+            transaction.open_table(TOKENS).map_err(broken)?.retain(|_, _| false).map_err(broken)?;
+            transaction.open_table(MEMBERS).map_err(broken)?.retain(|_, _| false).map_err(broken)?;
+            Ok(())
+        })
     }
 
     /// The URIs of all members, in order.
     pub(crate) fn members(&self) -> Result<Vec<String>, StoreError> {
-        let transaction = self.database.begin_read().map_err(broken)?;
-        let table = transaction.open_table(MEMBERS).map_err(broken)?;
-        let uris = table.iter().map_err(broken)?.map(|entry| entry.map(|(uri, _)| uri.value().to_owned()));
-        uris.collect::<Result<_, _>>().map_err(broken)
+        self.read(|transaction| {
+            let table = transaction.open_table(MEMBERS).map_err(broken)?;
+            let uris =
+                table.iter().map_err(broken)?.map(|entry| entry.map(|(uri, _)| uri.value().to_owned()));
+            uris.collect::<Result<_, _>>().map_err(broken)
+        })
     }
 }
 
@@ -450,6 +489,20 @@ mod tests {
     use proto::trust::{Authority, NewKey};
 
     use super::*;
+
+    #[test]
+    fn a_store_that_failed_is_opened_anew() {
+        let directory = tempfile::tempdir().unwrap();
+        let store = Store::open(directory.path()).unwrap();
+        let first = store.begin_epoch().unwrap();
+        let failed = store.write(|transaction| {
+            transaction.open_table(MEMBERS).map_err(broken)?.retain(|_, _| false).map_err(broken)?;
+            Err::<(), _>(StoreError::Broken("no space left on device".to_owned()))
+        });
+        failed.unwrap_err();
+        assert!(store.database.read().unwrap().is_none(), "it is not used as it is");
+        assert_eq!(store.begin_epoch().unwrap().0, first.0 + 1, "what was committed is there");
+    }
 
     #[test]
     fn epochs_grow_over_lives() {
