@@ -2,10 +2,18 @@
 
 use std::{path::PathBuf, str::FromStr, time::Duration};
 
-use clap::{Args, Parser, Subcommand, ValueEnum};
+use clap::{
+    Args, Parser, Subcommand, ValueEnum,
+    builder::{OsStringValueParser, TypedValueParser},
+};
 use mi_kernel::generate::RandomAlignment;
 
 use crate::{failure::Failure, target::Target};
+
+/// A path, or the empty text of an environment variable that was set to nothing.
+fn path_or_nothing() -> impl TypedValueParser<Value = PathBuf> {
+    OsStringValueParser::new().map(PathBuf::from)
+}
 
 /// Gleaner: a GPU compute farm whose idle devices glean work from busy ones.
 #[derive(Debug, Parser)]
@@ -16,7 +24,7 @@ pub(crate) struct Cli {
     pub coordinator: Option<String>,
     /// Who you are in a secured farm: what `init` or `join` has written; there, where it is written to
     /// [default: ~/.config/gleaner/user.pem, of nodes node.pem].
-    #[arg(long, env = "GLEANER_IDENTITY", value_name = "FILE", global = true)]
+    #[arg(long, env = "GLEANER_IDENTITY", value_name = "FILE", global = true, value_parser = path_or_nothing())]
     pub identity: Option<PathBuf>,
     /// Speak to a farm that is not secured, whatever identity there is.
     #[arg(

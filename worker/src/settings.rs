@@ -8,7 +8,10 @@ use std::{
 };
 
 use anyhow::{Context as _, bail, ensure};
-use clap::Parser;
+use clap::{
+    Parser,
+    builder::{OsStringValueParser, TypedValueParser as _},
+};
 use farm_core::worker::Share;
 use gpu_exec::DeviceSpec;
 use proto::trust::{Identity, Role, default_identity};
@@ -54,7 +57,7 @@ pub(crate) struct Arguments {
     device: Vec<String>,
     /// Who this node is in a secured farm: what `farmctl join` has written
     /// [default: ~/.config/gleaner/node.pem, if there is one].
-    #[arg(long, value_name = "FILE", env = "GLEANER_IDENTITY")]
+    #[arg(long, value_name = "FILE", env = "GLEANER_IDENTITY", value_parser = OsStringValueParser::new().map(PathBuf::from))]
     identity: Option<PathBuf>,
     /// Folder for caches: task data that came from elsewhere is kept there over restarts, 32 GiB of it unless
     /// `disk_cache_bytes` in the config file says otherwise. A folder for each worker [default: none].
@@ -219,8 +222,9 @@ fn check_host_port(key: &str, address: &str) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// The identity in the file given, or in the usual one if it is there.
+/// The identity in the file given, or in the usual one if it is there; a variable that was set to nothing gives none.
 fn identity(given: Option<PathBuf>) -> anyhow::Result<Option<Identity>> {
+    let given = given.filter(|path| !path.as_os_str().is_empty());
     let usual = || default_identity("node").filter(|path| path.exists());
     let Some(path) = given.or_else(usual) else { return Ok(None) };
     let identity = Identity::read(&path).context("identity")?;
