@@ -257,7 +257,7 @@ fn worker_event(step: Step) -> worker::Event {
             outcome: failure(step.one + u8::from(step.two == 3))
                 .map_or_else(|| Ok((vec![4, 8], ContentHash([1; 32]))), Err),
         },
-        20 if step.four == 1 => worker::Event::SpoolFull(step.one % 2 == 0),
+        20 if step.four == 1 => worker::Event::SpoolFull(step.one.is_multiple_of(2)),
         20 if step.four == 2 => worker::Event::ResultLost(job(step)),
         20 if step.four == 0 => worker::Event::DeviceLost { device, reason: "test".to_owned() },
         21 => worker::Event::FromCoordinator(CoordinatorToNode::AppJoined {

@@ -117,7 +117,7 @@ pub enum ExecutorEvent {
 }
 
 /// Settings of an executor. Fractions are of the device's estimated memory.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct ExecutorConfig {
     /// Compile modules without runtime checks (bounds, loop counters, division by zero). Only with the operator's
     /// permission: a wrong kernel may then crash the driver or read other jobs' memory.

@@ -23,7 +23,7 @@ fn measure(path: &str) -> Result<(), Box<dyn Error>> {
     let began = Instant::now();
     let scores = null.scores(0);
     let seconds = began.elapsed().as_secs_f64();
-    assert_eq!(scores.len(), pair_count(alignment.l()));
+    assert_eq!(scores.len(), pair_count(alignment.l()), "one score for each pair");
     println!("{path}: {seconds:.3} s an iteration");
     Ok(())
 }

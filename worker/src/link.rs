@@ -155,12 +155,14 @@ impl Outbox {
             Some(job) => self.spool.at_hand(job),
             None => Some(Vec::new()),
         };
-        let waits = match at_hand.map(|payload| self.sender.try_send(header.clone(), payload)) {
-            Some(Ok(())) => return,
-            Some(Err(TrySendError::Link(error))) => {
-                return tracing::debug!(%error, "a frame was dropped with its link");
-            }
-            Some(Err(TrySendError::Full(header, _))) => header,
+        let waits = match at_hand {
+            Some(payload) => match self.sender.try_send(header, payload) {
+                Ok(()) => return,
+                Err(TrySendError::Full(header, _)) => header,
+                Err(TrySendError::Link(error)) => {
+                    return tracing::debug!(%error, "a frame was dropped with its link");
+                }
+            },
             None => header,
         };
         *backlog = Some(VecDeque::from([waits]));

@@ -255,7 +255,8 @@ mod tests {
     }
 
     fn result(index: u32) -> Vec<Bytes> {
-        vec![Bytes::from(vec![index as u8; 30]), Bytes::new(), Bytes::from(vec![index as u8 + 100; 10])]
+        let tag = u8::try_from(index).unwrap();
+        vec![Bytes::from(vec![tag; 30]), Bytes::new(), Bytes::from(vec![tag + 100; 10])]
     }
 
     fn spool(memory_bytes: u64, disk: Option<(&Path, u64)>) -> (Spool, mpsc::Receiver<Input>) {

@@ -36,7 +36,9 @@ impl Compiled {
                 let _ = fs::hard_link(&reading, &file);
             }
             Err(error) if error.kind() == io::ErrorKind::NotFound => {}
-            Err(error) => tracing::warn!(file = %file.display(), %error, "compiled kernels are not taken from disk"),
+            Err(error) => {
+                tracing::warn!(file = %file.display(), %error, "compiled kernels are not taken from disk")
+            }
         }
         let _ = fs::remove_file(&reading);
         match made {

@@ -236,16 +236,17 @@ fn what_a_driver_compiled_is_kept_for_later_processes_and_spoilt_files_do_no_har
         program.memcpy_dtoh(values, 0, 16).unwrap();
         assert_eq!(as_u32(&device.run_program(program, &[module_bytes]).unwrap()[0]), [1; 4]);
     };
-    let files = || -> Vec<_> { fs::read_dir(&compiled).unwrap().map(|entry| entry.unwrap().path()).collect() };
+    let files =
+        || -> Vec<_> { fs::read_dir(&compiled).unwrap().map(|entry| entry.unwrap().path()).collect() };
     run();
     let [file] = &files()[..] else { panic!("one device, one file: {:?}", files()) };
     let first = fs::read(file).unwrap();
     run();
-    assert_eq!(files(), [file.clone()]);
+    assert_eq!(files(), std::slice::from_ref(file));
     for spoilt in [&first[..10], &[7; 1_000]] {
         fs::write(file, spoilt).unwrap();
         run();
-        assert_eq!(files(), [file.clone()], "it is written anew");
+        assert_eq!(files(), std::slice::from_ref(file), "it is written anew");
         assert_ne!(fs::read(file).unwrap(), spoilt);
     }
 }

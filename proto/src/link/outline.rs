@@ -155,7 +155,7 @@ mod tests {
     use super::*;
 
     fn pattern(size: usize) -> Vec<u8> {
-        (0..size).map(|at| (at * 31 + at / 251) as u8).collect()
+        (0..size).map(|at| (at * 31 + at / 251).to_le_bytes()[0]).collect()
     }
 
     #[test]
