@@ -54,10 +54,11 @@ const JOB_MATRIX_BYTES: u64 = 256 << 20;
 /// Bytes of sums that a device makes in a second at most, where a job may be that long: some five devices together fill
 /// what an application takes (about 500 MB/s).
 const SUMS_BYTES_PER_S: f64 = 80e6;
-/// A job has at most this share of the iterations left, and a run's last ones this share of its first ones' length:
-/// devices that end at different times wait for a short job.
+/// A job has at most this share of the iterations left, and a run's last ones this share of the others' length: devices that
+/// end at different times wait for a short job. Where results are large, twice what devices make else is the most.
 const LEFT_SHARE: u64 = 8;
 const SHORT_SHARE: u64 = 4;
+const SHORT_LARGE_SHARE: u64 = 2;
 
 /// What jobs bring back.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -245,7 +246,8 @@ impl Lengths {
             _ => 0,
         };
         let full = self.first.max(by_result).min(self.most);
-        full.min(left.div_ceil(LEFT_SHARE)).max(full.div_ceil(SHORT_SHARE))
+        let short = self.first.div_ceil(SHORT_SHARE).max(by_result.min(self.most) / SHORT_LARGE_SHARE);
+        full.min(left.div_ceil(LEFT_SHARE)).max(short)
     }
 
     fn result_bytes(&self, iterations: u64) -> u64 {
@@ -546,8 +548,8 @@ mod tests {
         let lengths = Lengths { mode: Mode::Reduce, by, pairs: 12_628_338, first: 3, most: 256 };
         assert_eq!(lengths.next(10_000, None), 3);
         assert_eq!(lengths.next(10_000, Some(0.044)), 71);
-        assert_eq!(lengths.next(240, Some(0.044)), 30);
-        assert_eq!(lengths.next(1, Some(0.044)), 18);
+        assert_eq!(lengths.next(400, Some(0.044)), 50);
+        assert_eq!(lengths.next(1, Some(0.044)), 35);
         assert_eq!(lengths.next(10_000, Some(1e-6)), 256);
         assert_eq!(lengths.next(10_000, Some(130.0)), 3, "slow devices: results are no burden");
         let fixed = Lengths { by: JobLengths::Fixed, ..lengths };

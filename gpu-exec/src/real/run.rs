@@ -31,6 +31,9 @@ const MAX_IN_FLIGHT: usize = 3;
 /// On a software adapter: lavapipe (Mesa 22.3) blocks in a submit until the one before it has run, and with it the thread
 /// that has to keep the limits.
 const MAX_IN_FLIGHT_CPU: usize = 1;
+/// Before a result is copied one more goes out for each of these bytes of it: the copy takes about as long as that runs, and no
+/// submit follows meanwhile.
+const COPY_BYTES_A_SUBMIT: u64 = 16 << 20;
 /// How long submits on the way may still take after the job is to end; a device that needs longer counts as hung.
 const GRACE: Duration = Duration::from_secs(2);
 
@@ -101,6 +104,11 @@ impl Run {
         self.ending.get_or_insert((failure, now));
     }
 
+    /// Bytes that [`Self::finish`] will copy.
+    pub(crate) fn result_bytes(&self) -> u64 {
+        if self.ending.is_some() { 0 } else { self.sections.iter().sum() }
+    }
+
     /// Nothing is left to submit or to wait for.
     pub(crate) fn is_over(&self) -> bool {
         self.in_flight.is_empty() && (self.steps.is_empty() || self.ending.is_some())
@@ -134,7 +142,22 @@ impl Run {
 
     /// Submits as much as may be on the way at once.
     pub(crate) fn fill(&mut self, gpu: &Gpu, timestamps: &mut TimestampPool, target: Duration) {
-        let most = if gpu.kind == DeviceKind::Gpu { MAX_IN_FLIGHT } else { MAX_IN_FLIGHT_CPU };
+        self.fill_for_copy(gpu, timestamps, target, 0);
+    }
+
+    /// The same before a result of another job of so many bytes is copied.
+    pub(crate) fn fill_for_copy(
+        &mut self,
+        gpu: &Gpu,
+        timestamps: &mut TimestampPool,
+        target: Duration,
+        copied_bytes: u64,
+    ) {
+        let more = usize::try_from(copied_bytes / COPY_BYTES_A_SUBMIT).unwrap_or(usize::MAX);
+        let most = match gpu.kind {
+            DeviceKind::Gpu => MAX_IN_FLIGHT.saturating_add(more),
+            DeviceKind::Cpu | DeviceKind::Simulated => MAX_IN_FLIGHT_CPU,
+        };
         while self.ending.is_none() && !self.steps.is_empty() && self.in_flight.len() < most {
             let command = self.next_command();
             match gpu.scoped(|| self.submit(gpu, timestamps, target)) {

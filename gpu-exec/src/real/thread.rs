@@ -259,7 +259,7 @@ impl DeviceThread {
             self.host.event(ExecutorEvent::Yielded { job: running.job });
             self.state.yielded = Some(running.paused(Instant::now()));
         }
-        let next = self.next_run();
+        let next = self.next_run(over.as_ref().map_or(0, Run::result_bytes));
         if let Some(over) = over {
             let job = over.job;
             let (device_time_ns, outcome) = over.finish(&mut self.state.caches);
@@ -271,8 +271,9 @@ impl DeviceThread {
         }
     }
 
-    /// Starts what is prepared, or lets the interrupted job go on: that goes first, unless it is outranked.
-    fn next_run(&mut self) -> Option<(Run, ExecutorEvent)> {
+    /// Starts what is prepared, or lets the interrupted job go on: that goes first, unless it is outranked. The device has enough
+    /// to do then until so many bytes are copied.
+    fn next_run(&mut self, copied_bytes: u64) -> Option<(Run, ExecutorEvent)> {
         let class = self.state.yielded.as_ref().map(|yielded| yielded.class);
         let yielded = match class {
             Some(class) if !self.state.outranks(class) => self.state.yielded.take(),
@@ -290,7 +291,8 @@ impl DeviceThread {
                 (run, event)
             }
         };
-        run.fill(&self.state.gpu, &mut self.state.timestamps, self.config.submit_target);
+        let State { gpu, timestamps, .. } = &mut self.state;
+        run.fill_for_copy(gpu, timestamps, self.config.submit_target, copied_bytes);
         Some((run, event))
     }
 
