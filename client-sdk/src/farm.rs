@@ -207,8 +207,9 @@ fn connect_error(options: &FarmOptions, error: SessionError) -> FarmError {
         SessionError::Refused { reason } => FarmError::Refused { address, reason },
         SessionError::Denied { reason } => FarmError::Denied { address, reason },
         SessionError::Unreachable { reason, .. } => FarmError::Unreachable { address, reason },
-        error @ (SessionError::Ended { .. } | SessionError::Malformed { .. } | SessionError::Full) => {
-            FarmError::Unreachable { address, reason: error.to_string() }
-        }
+        error @ (SessionError::Ended { .. }
+        | SessionError::Malformed { .. }
+        | SessionError::Failed { .. }
+        | SessionError::Full) => FarmError::Unreachable { address, reason: error.to_string() },
     }
 }

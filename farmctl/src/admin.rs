@@ -127,6 +127,7 @@ pub(crate) fn failure(error: SessionError) -> Failure {
         SessionError::Ended { .. }
         | SessionError::Malformed { .. }
         | SessionError::Refused { .. }
+        | SessionError::Failed { .. }
         | SessionError::Full => Failure::Work(error.into()),
     }
 }

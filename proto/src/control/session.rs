@@ -55,6 +55,12 @@ pub enum SessionError {
     /// The coordinator said something that this build does not understand. Not to be retried.
     #[error("a message of the coordinator is malformed: {0}")]
     Malformed(#[from] WireError),
+    /// The coordinator could not do it.
+    #[error("the coordinator failed: {reason}")]
+    Failed {
+        /// Its words.
+        reason: String,
+    },
     /// The request was refused (an unknown node, say). Not to be retried.
     #[error("refused by the coordinator: {reason}")]
     Refused {
@@ -312,12 +318,12 @@ pub(super) async fn within_timeout<T>(
         Err(_) => Err(unreachable(format!("no answer within {ADMIN_TIMEOUT:?}"))),
         Ok(Ok(answer)) => Ok(answer),
         Ok(Err(status))
-            if matches!(
-                status.code(),
-                Code::NotFound | Code::InvalidArgument | Code::FailedPrecondition | Code::Internal
-            ) =>
+            if matches!(status.code(), Code::NotFound | Code::InvalidArgument | Code::FailedPrecondition) =>
         {
             Err(SessionError::Refused { reason: status.message().to_owned() })
+        }
+        Ok(Err(status)) if status.code() == Code::Internal => {
+            Err(SessionError::Failed { reason: status.message().to_owned() })
         }
         Ok(Err(status)) if is_denial(&status) => {
             Err(SessionError::Denied { reason: status.message().to_owned() })
