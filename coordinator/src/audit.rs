@@ -105,7 +105,7 @@ impl Audit {
 
 impl Log {
     fn append(&mut self, line: &Value, durable: bool) {
-        let written = self.turn_over().and_then(|()| self.find_again()).and_then(|()| {
+        let written = self.find_again().and_then(|()| self.turn_over()).and_then(|()| {
             let text = format!("{line}\n");
             self.bytes += text.len() as u64;
             self.file.write_all(text.as_bytes())?;

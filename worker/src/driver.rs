@@ -30,7 +30,7 @@ use tokio::{
 use crate::{
     End, WorkerOptions,
     contents::{Contents, Fetched},
-    device::{Device, DeviceEvent, DeviceNews},
+    device::{Device, DeviceEvent, DeviceNews, Payload},
     executor::{Executor, Order},
     link::{self, Outbox, Source},
     programs::Programs,
@@ -367,15 +367,20 @@ impl Driver {
                 if let Some(device) = self.devices.get_mut(usize::from(device.0)) {
                     device.finished();
                 }
-                let outcome = outcome.map(|payload| {
-                    let lengths = payload.sections.iter().map(|section| section.len() as u64).collect();
-                    // An aborted job's program is forgotten; its result must not stay behind.
-                    if self.programs.discard(job).is_some() {
-                        self.spool.keep(job, payload.sections);
+                let (outcome, sections) = match outcome {
+                    Ok(Payload { sections, digest }) => {
+                        let lengths = sections.iter().map(|section| section.len() as u64).collect();
+                        (Ok((lengths, digest)), sections)
                     }
-                    (lengths, payload.digest)
-                });
+                    Err(failure) => (Err(failure), Vec::new()),
+                };
+                let completed = outcome.is_ok();
                 self.tell(Event::Executed { job, device, device_time_ns, outcome });
+                // Not if it was taken back meanwhile, and runs on another device or not at all: the bytes belong to the header.
+                if completed && self.machine.executed_on(job) == Some(device) {
+                    self.programs.discard(job);
+                    self.spool.keep(job, sections);
+                }
             }
             DeviceNews::Lost(reason) => {
                 tracing::error!(%device, reason, "a device is lost");

@@ -20,7 +20,7 @@ impl Programs {
     }
 
     /// It will not run again, or is not here.
-    pub(crate) fn discard(&mut self, job: JobAttempt) -> Option<Bytes> {
-        self.0.remove(&job)
+    pub(crate) fn discard(&mut self, job: JobAttempt) {
+        self.0.remove(&job);
     }
 }

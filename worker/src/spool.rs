@@ -24,6 +24,8 @@ use crate::driver::Input;
 
 /// Results are written to one file until it holds this many bytes.
 const FILE_BYTES: u64 = 64 << 20;
+/// And this share of the memory's room at a time.
+const SPILLED_SHARE: u64 = 4;
 /// How long a disk that did not take a result is left alone.
 const DISK_REST: Duration = Duration::from_secs(10);
 /// While the disk takes results, memory may hold this many times its room.
@@ -69,7 +71,7 @@ struct State {
 #[derive(Debug)]
 enum Held {
     Memory { serial: u64, sections: Vec<Bytes> },
-    Disk { file: Arc<SpoolFile>, offset: u64, lengths: Vec<usize> },
+    Disk { file: Arc<SpoolFile>, offset: u64, lengths: Vec<usize>, digest: blake3::Hash },
 }
 
 /// A file without a name.
@@ -100,11 +102,7 @@ impl Spool {
         state.memory_bytes += size_of(&sections);
         state.in_memory.insert(serial, job);
         state.results.insert(job, Held::Memory { serial, sections });
-        if state.memory_bytes > self.room.memory_bytes && !state.spilling && self.disk_takes(&state) {
-            state.spilling = true;
-            let spool = self.clone();
-            tokio::task::spawn_blocking(move || spool.spill());
-        }
+        self.spill_if_needed(&mut state);
     }
 
     /// A result, if it is in memory.
@@ -120,14 +118,19 @@ impl Spool {
     /// # Errors
     /// The disk does not give it back.
     pub(crate) async fn read(&self, job: JobAttempt) -> io::Result<Option<Vec<Bytes>>> {
-        let (file, offset, lengths) = match self.state().results.get(&job) {
+        let (file, offset, lengths, digest) = match self.state().results.get(&job) {
             None => return Ok(None),
             Some(Held::Memory { sections, .. }) => return Ok(Some(sections.clone())),
-            Some(Held::Disk { file, offset, lengths }) => (Arc::clone(file), *offset, lengths.clone()),
+            Some(Held::Disk { file, offset, lengths, digest }) => {
+                (Arc::clone(file), *offset, lengths.clone(), *digest)
+            }
         };
         let reading = tokio::task::spawn_blocking(move || {
             let mut bytes = vec![0; lengths.iter().sum()];
             file.file.read_exact_at(&mut bytes, offset)?;
+            if blake3::hash(&bytes) != digest {
+                return Err(io::Error::new(io::ErrorKind::InvalidData, "the disk gave other bytes back"));
+            }
             let mut rest = Bytes::from(bytes);
             Ok(Some(lengths.iter().map(|length| rest.split_to(*length)).collect()))
         });
@@ -139,9 +142,10 @@ impl Spool {
         self.state().forget(job);
     }
 
-    /// Whether no more results should be made, if that changed.
+    /// Whether no more results should be made, if that changed. Looks whether the disk takes results again, too.
     pub(crate) fn news(&self) -> Option<bool> {
         let mut state = self.state();
+        self.spill_if_needed(&mut state);
         let room = self.room.memory_bytes;
         let most = if self.disk_takes(&state) { room.saturating_mul(MEMORY_EXCESS) } else { room };
         let full = state.memory_bytes > most;
@@ -153,9 +157,20 @@ impl Spool {
     }
 
     fn disk_takes(&self, state: &State) -> bool {
-        let Some((_, cap_bytes)) = &self.room.disk else { return false };
-        state.disk_bytes.load(Ordering::Relaxed) < *cap_bytes
-            && state.disk_failed.is_none_or(|failed| failed.elapsed() > DISK_REST)
+        self.disk_room_bytes(state) > 0 && state.disk_failed.is_none_or(|failed| failed.elapsed() > DISK_REST)
+    }
+
+    fn disk_room_bytes(&self, state: &State) -> u64 {
+        let cap_bytes = self.room.disk.as_ref().map_or(0, |(_, cap_bytes)| *cap_bytes);
+        cap_bytes.saturating_sub(state.disk_bytes.load(Ordering::Relaxed))
+    }
+
+    fn spill_if_needed(&self, state: &mut State) {
+        if state.memory_bytes > self.room.memory_bytes && !state.spilling && self.disk_takes(state) {
+            state.spilling = true;
+            let spool = self.clone();
+            tokio::task::spawn_blocking(move || spool.spill());
+        }
     }
 
     /// Writes the oldest results to disk until the others fit into memory. Blocks.
@@ -164,7 +179,7 @@ impl Spool {
             let written = self.write(&oldest);
             let mut state = self.state();
             match written {
-                Ok(file) => state.spilled(oldest, &Arc::new(file)),
+                Ok((file, digests)) => state.spilled(oldest, &digests, &Arc::new(file)),
                 Err(error) => {
                     tracing::warn!(%error, "results cannot be kept on disk; they stay in memory, and no more are made than it holds");
                     state.disk_failed = Some(Instant::now());
@@ -183,15 +198,21 @@ impl Spool {
             state.spilling = false;
             return None;
         }
-        let mut excess = state.memory_bytes.saturating_sub(self.room.memory_bytes);
+        // With some more than the excess: a file each for the next small results would be many files.
+        let mut excess = match state.memory_bytes.saturating_sub(self.room.memory_bytes) {
+            0 => 0,
+            excess => excess + self.room.memory_bytes / SPILLED_SHARE,
+        };
+        let most = FILE_BYTES.min(self.disk_room_bytes(&state));
         let mut file_bytes = 0;
         let mut oldest = Vec::new();
         for job in state.in_memory.values() {
             let Some(Held::Memory { sections, .. }) = state.results.get(job) else { continue };
-            if excess == 0 || file_bytes >= FILE_BYTES {
+            let size_bytes = size_of(sections);
+            // One goes whatever its size.
+            if excess == 0 || (file_bytes > 0 && file_bytes + size_bytes > most) {
                 break;
             }
-            let size_bytes = size_of(sections);
             excess = excess.saturating_sub(size_bytes);
             file_bytes += size_bytes;
             oldest.push((*job, sections.clone()));
@@ -200,17 +221,24 @@ impl Spool {
         state.spilling.then_some(oldest)
     }
 
-    fn write(&self, results: &[(JobAttempt, Vec<Bytes>)]) -> io::Result<SpoolFile> {
+    /// The results in one file, with the digest of each.
+    fn write(&self, results: &[(JobAttempt, Vec<Bytes>)]) -> io::Result<(SpoolFile, Vec<blake3::Hash>)> {
         let (folder, _) = self.room.disk.as_ref().ok_or_else(|| io::Error::other("there is no folder"))?;
         let mut file = tempfile::tempfile_in(folder)?;
         let mut bytes = 0;
-        for section in results.iter().flat_map(|(_, sections)| sections) {
-            file.write_all(section)?;
-            bytes += section.len() as u64;
+        let mut digests = Vec::with_capacity(results.len());
+        for (_, sections) in results {
+            let mut digest = blake3::Hasher::new();
+            for section in sections {
+                file.write_all(section)?;
+                digest.update(section);
+            }
+            bytes += size_of(sections);
+            digests.push(digest.finalize());
         }
         let disk_bytes = Arc::clone(&self.state().disk_bytes);
         disk_bytes.fetch_add(bytes, Ordering::Relaxed);
-        Ok(SpoolFile { file, bytes, disk_bytes })
+        Ok((SpoolFile { file, bytes, disk_bytes }, digests))
     }
 }
 
@@ -223,14 +251,19 @@ impl State {
     }
 
     /// These are on disk now; those that were acknowledged meanwhile need no place.
-    fn spilled(&mut self, results: Vec<(JobAttempt, Vec<Bytes>)>, file: &Arc<SpoolFile>) {
+    fn spilled(
+        &mut self,
+        results: Vec<(JobAttempt, Vec<Bytes>)>,
+        digests: &[blake3::Hash],
+        file: &Arc<SpoolFile>,
+    ) {
         let mut offset = 0;
-        for (job, sections) in results {
+        for ((job, sections), &digest) in results.into_iter().zip(digests) {
             let size_bytes = size_of(&sections);
             if self.results.contains_key(&job) {
                 self.forget(job);
                 let lengths = sections.iter().map(Bytes::len).collect();
-                self.results.insert(job, Held::Disk { file: Arc::clone(file), offset, lengths });
+                self.results.insert(job, Held::Disk { file: Arc::clone(file), offset, lengths, digest });
             }
             offset += size_bytes;
         }
@@ -291,6 +324,30 @@ mod tests {
         let state = spool.state();
         assert_eq!((state.memory_bytes, state.disk_bytes.load(Ordering::Relaxed)), (0, 0));
         assert!(state.results.is_empty() && state.in_memory.is_empty(), "nothing stays behind");
+    }
+
+    #[tokio::test]
+    async fn other_bytes_from_the_disk_are_an_error() {
+        let folder = tempfile::tempdir().unwrap();
+        let (spool, mut received) = spool(0, Some((folder.path(), 1_000)));
+        spool.keep(job(0), result(0));
+        spilled(&mut received).await;
+        match spool.state().results.get(&job(0)) {
+            Some(Held::Disk { file, .. }) => file.file.write_all_at(b"x", 5).unwrap(),
+            held => panic!("it is on disk: {held:?}"),
+        }
+        assert_eq!(spool.read(job(0)).await.unwrap_err().kind(), io::ErrorKind::InvalidData);
+    }
+
+    #[tokio::test]
+    async fn small_results_share_a_file() {
+        let folder = tempfile::tempdir().unwrap();
+        let (spool, mut received) = spool(400, Some((folder.path(), 10_000)));
+        (0..11).for_each(|index| spool.keep(job(index), result(index)));
+        spilled(&mut received).await;
+        let state = spool.state();
+        let on_disk = state.results.values().filter(|held| matches!(held, Held::Disk { .. })).count();
+        assert!(on_disk >= 3, "a quarter of the room besides the excess of one: {on_disk}");
     }
 
     #[tokio::test]

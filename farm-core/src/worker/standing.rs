@@ -1,7 +1,7 @@
 //! How a node stands, for operators and auditors. It reads, and changes nothing.
 
-use super::WorkerMachine;
-use crate::id::{AppId, JobAttempt};
+use super::{WorkerMachine, job::HeldState};
+use crate::id::{AppId, DeviceIndex, JobAttempt};
 
 /// How an application stands with a node's fair share.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -28,6 +28,13 @@ impl WorkerMachine {
     #[must_use]
     pub fn held_jobs(&self) -> usize {
         self.jobs.len()
+    }
+
+    /// Where an attempt ran whose result waits here for its application.
+    #[must_use]
+    pub fn executed_on(&self, job: JobAttempt) -> Option<DeviceIndex> {
+        let held = self.jobs.get(&job.job).filter(|held| held.attempt == job.attempt)?;
+        matches!(held.state, HeldState::Executed(_)).then_some(held.device)
     }
 
     /// Whether an attempt is here, in whatever state.

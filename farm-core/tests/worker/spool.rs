@@ -1,6 +1,10 @@
 //! Results that nobody takes: they cost their application its turn, and nobody else anything.
 
-use farm_core::{id::JobAttempt, message::LatencyClass, worker::Event};
+use farm_core::{
+    id::{ContentHash, DeviceIndex, JobAttempt},
+    message::LatencyClass,
+    worker::Event,
+};
 
 use crate::node::Node;
 
@@ -62,6 +66,32 @@ fn while_the_spool_is_full_only_who_takes_results_gets_on() {
     assert!(node.orders().is_empty(), "the other still owes acknowledgements");
     node.tell(Event::SpoolFull(false));
     assert_eq!(run_all(&mut node, 10), slow, "there is room again");
+}
+
+#[test]
+fn a_result_belongs_to_the_device_that_the_machine_waits_for() {
+    let mut node = Node::new(2, true, 1);
+    let [job] = node.jobs(1, 0, 1, LatencyClass::Batch)[..] else { panic!("one was asked for") };
+    let [(_, device, _)] = node.orders()[..] else { panic!("it is staged at once") };
+    node.started(job, device);
+    let (here, other) = (DeviceIndex(device), DeviceIndex(1 - device));
+    node.tell(Event::Executed {
+        job,
+        device: other,
+        device_time_ns: 1,
+        outcome: Ok((vec![4], ContentHash([9; 32]))),
+    });
+    assert_eq!(node.machine.executed_on(job), None, "another device's bytes are nobody's");
+    node.done_with(job, device, 10);
+    node.tell(Event::Executed {
+        job,
+        device: other,
+        device_time_ns: 1,
+        outcome: Ok((vec![4], ContentHash([9; 32]))),
+    });
+    assert_eq!(node.machine.executed_on(job), Some(here));
+    node.acknowledge(job);
+    assert_eq!(node.machine.executed_on(job), None, "it is over");
 }
 
 #[test]

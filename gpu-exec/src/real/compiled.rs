@@ -6,6 +6,7 @@ use std::{
     fs, io,
     path::{Path, PathBuf},
     process,
+    time::Duration,
 };
 
 use super::{adapter::Gpu, trusted};
@@ -13,6 +14,8 @@ use super::{adapter::Gpu, trusted};
 /// Most bytes of a file: more is neither read nor written.
 const MAX_BYTES: usize = 256 << 20;
 const DIGEST_BYTES: usize = blake3::OUT_LEN;
+/// A file that was being read or written, this old, is of a process that is gone.
+const ABANDONED_AFTER: Duration = Duration::from_secs(3_600);
 
 /// The driver's cache, with its file.
 #[derive(Debug)]
@@ -26,6 +29,7 @@ impl Compiled {
     pub(super) fn open(gpu: &Gpu, folder: &Path) -> Option<Self> {
         let file = folder.join(gpu.compiled_key.as_ref()?);
         let reading = file.with_extension(format!("reading-{}", process::id()));
+        remove_abandoned(folder);
         // A driver that does not survive these bytes does not meet them again.
         let moved = fs::rename(&file, &reading);
         let data = moved.and_then(|()| read(&reading));
@@ -59,6 +63,22 @@ impl Compiled {
         let Some(data) = self.cache.get_data().filter(|data| data.len() <= MAX_BYTES) else { return };
         if let Err(error) = write(&self.file, &data) {
             tracing::debug!(file = %self.file.display(), %error, "compiled kernels are not kept on disk");
+        }
+    }
+}
+
+/// Removes what processes that are gone were reading or writing.
+fn remove_abandoned(folder: &Path) {
+    for entry in fs::read_dir(folder).into_iter().flatten().flatten() {
+        let path = entry.path();
+        let unfinished = path
+            .extension()
+            .and_then(|extension| extension.to_str())
+            .is_some_and(|extension| extension.starts_with("reading-") || extension.starts_with("writing-"));
+        let changed = entry.metadata().and_then(|metadata| metadata.modified());
+        if unfinished && changed.is_ok_and(|at| at.elapsed().is_ok_and(|age| age > ABANDONED_AFTER)) {
+            // It will be tried again at the next start.
+            let _ = fs::remove_file(path);
         }
     }
 }

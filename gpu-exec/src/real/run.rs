@@ -34,6 +34,8 @@ const MAX_IN_FLIGHT_CPU: usize = 1;
 /// Before a result is copied one more goes out for each of these bytes of it: the copy takes about as long as that runs, and no
 /// submit follows meanwhile.
 const COPY_BYTES_A_SUBMIT: u64 = 16 << 20;
+/// At most so many: an interruption waits for them.
+const MAX_FOR_COPY: usize = 16;
 /// How long submits on the way may still take after the job is to end; a device that needs longer counts as hung.
 const GRACE: Duration = Duration::from_secs(2);
 
@@ -155,7 +157,7 @@ impl Run {
     ) {
         let more = usize::try_from(copied_bytes / COPY_BYTES_A_SUBMIT).unwrap_or(usize::MAX);
         let most = match gpu.kind {
-            DeviceKind::Gpu => MAX_IN_FLIGHT.saturating_add(more),
+            DeviceKind::Gpu => MAX_IN_FLIGHT + more.min(MAX_FOR_COPY),
             DeviceKind::Cpu | DeviceKind::Simulated => MAX_IN_FLIGHT_CPU,
         };
         while self.ending.is_none() && !self.steps.is_empty() && self.in_flight.len() < most {

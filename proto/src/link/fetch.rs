@@ -63,6 +63,12 @@ pub struct Arrived {
 }
 
 impl Arrived {
+    /// All of a content.
+    #[cfg(test)]
+    pub(super) fn of(content: &ContentBytes) -> Self {
+        Self { bytes: BytesMut::from(&content[..]) }
+    }
+
     /// How many bytes are here.
     #[must_use]
     pub fn size_bytes(&self) -> u64 {
@@ -84,7 +90,10 @@ pub(super) async fn fetch(
     let lost = |_| FetchError::Link(shared.error());
     // Waits while FETCH_STREAMS are on the way.
     let (mut request, mut answer) = shared.connection.open_bi().await.map_err(LinkError::from)?;
-    let first = u32::try_from(arrived.bytes.len() / PIECE_BYTES).expect("the cap is some thousand pieces");
+    // Of another size under the same name nothing counts; nor does the last piece, if all was here but its end was not heard.
+    let whole_pieces = if arrived.bytes.len() > size { 0 } else { arrived.bytes.len() / PIECE_BYTES };
+    arrived.bytes.truncate(whole_pieces * PIECE_BYTES);
+    let first = u32::try_from(whole_pieces).expect("the cap is some thousand pieces");
     let mut buffer = BytesMut::with_capacity(REQUEST_BYTES);
     buffer.put_slice(&hash.0);
     buffer.put_u64_le(content.size_bytes);
@@ -149,7 +158,7 @@ async fn read_pieces(
     let came = bytes.len();
     bytes.truncate(checked);
     outcome?;
-    if came < size {
+    if came != size {
         return Err(FetchError::Corrupt { hash, reason: format!("{came} B came of {size} B") });
     }
     // Without any byte there was nothing to check.

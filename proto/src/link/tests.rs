@@ -499,6 +499,32 @@ async fn a_fetch_that_breaks_off_goes_on_at_another_peer() {
     );
 }
 
+#[tokio::test]
+async fn what_arrived_counts_for_its_own_content_alone() {
+    let whole = ContentBytes::new(pattern(3 * PIECE_BYTES + 7));
+    let kept = whole.clone();
+    let source = || {
+        let kept = kept.clone();
+        ContentSource::new(move |_| Some(kept.clone()))
+    };
+    // All of it came, but not the end of the stream: the last piece comes again.
+    let (_app, node, _server) = linked(source()).await;
+    let mut arrived = Arrived::of(&whole);
+    assert_eq!(node.sender.fetch(whole.content(), &mut arrived).await.unwrap(), whole);
+    // Somebody says that it is shorter than what is here.
+    let (peer, node, _server) = raw_peer().await;
+    let mut arrived = Arrived::of(&whole);
+    let lie = async {
+        let (mut answer, _request) = peer.accept_bi().await.unwrap();
+        answer.write_all(&[1]).await.unwrap();
+        answer.write_all(&(PIECE_BYTES as u64).to_le_bytes()).await.unwrap();
+        answer.finish().unwrap();
+    };
+    let shorter = Content { size_bytes: PIECE_BYTES as u64, ..whole.content() };
+    let (outcome, ()) = tokio::join!(node.sender.fetch(shorter, &mut arrived), lie);
+    assert!(matches!(outcome, Err(FetchError::Corrupt { .. })), "got {outcome:?}");
+}
+
 /// What an honest peer sends before the pieces.
 fn fetch_head(content: &ContentBytes) -> Vec<u8> {
     let mut head = vec![1];
