@@ -220,6 +220,18 @@ fn slices_of_any_size_cover_each_layer_exactly_once() {
     }
 }
 
+/// Runs one small kernel on zeros and looks at what it made of them.
+fn increments(device: &TestDevice) {
+    let (module, module_bytes) = content(INCREMENT.as_bytes());
+    let mut program = JobProgram::default();
+    let values = program.malloc(16).unwrap();
+    let increment = program.function(module, "increment");
+    program.param_in_out(increment, 0, values).unwrap();
+    program.launch(increment, [1, 1, 1]).unwrap();
+    program.memcpy_dtoh(values, 0, 16).unwrap();
+    assert_eq!(as_u32(&device.run_program(program, &[module_bytes]).unwrap()[0]), [1; 4]);
+}
+
 #[test]
 fn what_a_driver_compiled_is_kept_for_later_processes_and_spoilt_files_do_no_harm() {
     let folder = tempfile::tempdir().unwrap();
@@ -227,14 +239,7 @@ fn what_a_driver_compiled_is_kept_for_later_processes_and_spoilt_files_do_no_har
     let run = || {
         let compiled = Some(compiled.clone());
         let device = TestDevice::with(ExecutorConfig { compiled, ..ExecutorConfig::default() });
-        let (module, module_bytes) = content(INCREMENT.as_bytes());
-        let mut program = JobProgram::default();
-        let values = program.malloc(16).unwrap();
-        let increment = program.function(module, "increment");
-        program.param_in_out(increment, 0, values).unwrap();
-        program.launch(increment, [1, 1, 1]).unwrap();
-        program.memcpy_dtoh(values, 0, 16).unwrap();
-        assert_eq!(as_u32(&device.run_program(program, &[module_bytes]).unwrap()[0]), [1; 4]);
+        increments(&device);
     };
     let files =
         || -> Vec<_> { fs::read_dir(&compiled).unwrap().map(|entry| entry.unwrap().path()).collect() };
@@ -254,14 +259,7 @@ fn what_a_driver_compiled_is_kept_for_later_processes_and_spoilt_files_do_no_har
 #[test]
 fn kernels_run_without_runtime_checks_where_the_operator_allows_it() {
     let device = TestDevice::with(ExecutorConfig { unchecked: true, ..ExecutorConfig::default() });
-    let (module, module_bytes) = content(INCREMENT.as_bytes());
-    let mut program = JobProgram::default();
-    let values = program.malloc(16).unwrap();
-    let increment = program.function(module, "increment");
-    program.param_in_out(increment, 0, values).unwrap();
-    program.launch(increment, [1, 1, 1]).unwrap();
-    program.memcpy_dtoh(values, 0, 16).unwrap();
-    assert_eq!(as_u32(&device.run_program(program, &[module_bytes]).unwrap()[0]), [1; 4]);
+    increments(&device);
 }
 
 #[test]
