@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use super::{
     CoordinatorMachine,
-    model::{JobState, Peer},
+    model::{Batch, JobState, Peer},
     rates::Module,
     steal::MAX_STEALS,
 };
@@ -42,10 +42,12 @@ impl CoordinatorMachine {
     fn check_jobs(&self) {
         let mut attempts = BTreeSet::new();
         for (id, app) in &self.apps {
-            let mut open: BTreeMap<_, u32> = BTreeMap::new();
+            let mut open: BTreeMap<_, (u32, u32)> = BTreeMap::new();
             let mut waiting = 0;
             for (key, job) in &app.jobs {
-                *open.entry(job.batch).or_default() += 1;
+                let (jobs, placed) = open.entry(job.batch).or_default();
+                *jobs += 1;
+                *placed += u32::from(matches!(job.state, JobState::Placed(_)));
                 match job.state.holder() {
                     None => waiting += 1,
                     Some((node, attempt)) => {
@@ -60,8 +62,9 @@ impl CoordinatorMachine {
                 assert!(!app.failed.contains_key(key), "I2: {id} {key} is open and failed");
             }
             assert_eq!(waiting, app.waiting_jobs, "I1: {id} counts its waiting jobs");
-            let batches: BTreeMap<_, u32> =
-                app.batches.iter().map(|(&id, batch)| (id, batch.open_jobs)).collect();
+            let counts = |batch: &Batch| (batch.open_jobs, batch.placed_jobs);
+            let batches: BTreeMap<_, _> =
+                app.batches.iter().map(|(&id, batch)| (id, counts(batch))).collect();
             assert_eq!(open, batches, "I8: {id} keeps exactly the batches that have open jobs");
         }
     }
@@ -126,7 +129,13 @@ impl CoordinatorMachine {
     fn check_queue(&self) {
         let mut queued: BTreeSet<(AppId, JobKey)> = BTreeSet::new();
         let asked = self.questions.values().map(|asked| &asked.pending);
-        for pending in self.stuck.iter().chain(asked) {
+        for (id, pending) in &self.reserved {
+            let batch = self.apps.get(&id.0).and_then(|app| app.batches.get(&id.1));
+            let waits = batch.is_some_and(|batch| batch.placed_jobs > 0);
+            assert!(waits, "I1: {} of {} has jobs held back, and nothing to wait for", id.1, id.0);
+            assert_eq!(*id, (pending.app, pending.batch), "I8: what is held back is of another batch");
+        }
+        for pending in self.stuck.iter().chain(asked).chain(self.reserved.values()) {
             let Some(app) = self.apps.get(&pending.app) else {
                 panic!("I8: jobs of {}, which left, are in line", pending.app)
             };

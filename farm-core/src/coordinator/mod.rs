@@ -14,6 +14,7 @@ mod contents;
 mod invariants;
 mod lease;
 mod model;
+mod neighbours;
 mod placement;
 pub mod policy;
 mod rates;
@@ -21,6 +22,7 @@ mod recovery;
 mod registry;
 mod replan;
 mod report;
+mod reserve;
 mod speculate;
 mod status;
 mod steal;
@@ -305,6 +307,8 @@ pub struct CoordinatorMachine {
     fresh: VecDeque<Pending>,
     /// Jobs that no device can take now, first come, first served; tried again when that may have changed.
     stuck: VecDeque<Pending>,
+    /// Jobs that are held back until those before them have nearly ended: of the policy `neighbours`.
+    reserved: BTreeMap<(AppId, BatchId), Pending>,
     /// Batches that a plug-in was asked about.
     questions: BTreeMap<QuestionId, Asked>,
     next_question: u64,
@@ -350,6 +354,7 @@ impl CoordinatorMachine {
             history: History::default(),
             fresh: VecDeque::new(),
             stuck: VecDeque::new(),
+            reserved: BTreeMap::new(),
             questions: BTreeMap::new(),
             next_question: 1,
             plugin_faults: BTreeMap::new(),

@@ -6,9 +6,11 @@ use std::collections::{BTreeMap, BTreeSet};
 use super::{
     NodeState,
     breaker::Breaker,
+    neighbours::Samples,
     policy::Policy,
     rates::{Load, Module, Modules, Throughput},
     recovery::Brought,
+    reserve::Low,
 };
 use crate::{
     device::{DeviceInfo, Requirements},
@@ -85,6 +87,11 @@ pub(super) struct Batch {
     pub(super) contents: Vec<Content>,
     /// Its jobs in [`App::jobs`].
     pub(super) open_jobs: u32,
+    /// Those of them that have a place and are not executed.
+    pub(super) placed_jobs: u32,
+    /// Under the policy `neighbours`: what jobs took, and when the next part of those held back is due.
+    pub(super) samples: Samples,
+    pub(super) low: Low,
     /// The reason for waiting that the application was told last.
     pub(super) told: Option<WaitReason>,
 }
@@ -109,7 +116,7 @@ pub(super) struct Job {
 /// Where a job is, as far as the coordinator knows.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum JobState {
-    /// In `fresh`, `stuck` or `lost`.
+    /// In `fresh`, `stuck`, `lost` or `reserved`.
     Waiting,
     /// Planned; in transit, queued or running.
     Placed(Placement),

@@ -8,11 +8,13 @@ use std::collections::BTreeMap;
 use super::{
     CoordinatorMachine, NodeState,
     model::{App, Batch, Job, JobState, Node, Pending, Placement},
+    neighbours::Samples,
     policy::{Choice, Fcfs, LongestFirst, PlacementPolicy, Policy, Question, QuestionDevice, QuestionJob},
     rates::{Load, Module},
+    reserve::Low,
 };
 use crate::{
-    id::{AppId, Attempt, BatchId, DeviceIndex, JobAttempt, JobKey, NodeId, TaskId},
+    id::{AppId, Attempt, BatchId, DeviceIndex, JobAttempt, JobIndex, JobKey, NodeId, TaskId},
     message::{CoordinatorToApp, CostNs, DevicePlan, NodePlan, Plan, PlanRequest, WaitReason},
     time::Instant,
 };
@@ -93,6 +95,7 @@ impl CoordinatorMachine {
     pub(super) fn forget_pending(&mut self, gone: impl Fn(&Pending) -> bool) {
         self.fresh.retain(|pending| !gone(pending));
         self.stuck.retain(|pending| !gone(pending));
+        self.reserved.retain(|_, pending| !gone(pending));
         self.questions.retain(|_, asked| !gone(&asked.pending));
     }
 
@@ -104,6 +107,10 @@ impl CoordinatorMachine {
             }
             queue.retain(|pending| !pending.keys.is_empty());
         }
+        self.reserved.retain(|_, pending| {
+            pending.keys.retain(|key| pending.app != id || key.task != task);
+            !pending.keys.is_empty()
+        });
         self.questions.retain(|_, asked| (asked.pending.app, asked.task) != (id, task));
     }
 
@@ -139,8 +146,12 @@ impl CoordinatorMachine {
     }
 
     fn place_batch(&mut self, now: Instant, pending: Pending) {
+        let estimates = self.learn_from_neighbours(&pending);
         let Some((pending, mut question)) = self.question(now, pending) else { return };
         let Some(app) = self.apps.get(&pending.app) else { return };
+        if let Some(estimates) = &estimates {
+            recall_told(app, &mut question, |index| estimates.cost(index));
+        }
         let choices = match &app.policy {
             Policy::Fcfs => Fcfs.place(&question),
             Policy::History => {
@@ -149,6 +160,11 @@ impl CoordinatorMachine {
                     self.history.recall(&app.name, load, &mut question.jobs);
                 }
                 LongestFirst.place(&question)
+            }
+            // What lost its place need not wait for a part.
+            Policy::Neighbours if pending.answers.is_none() => Fcfs.place(&question),
+            Policy::Neighbours => {
+                return self.place_part(now, &pending, question, estimates.as_ref());
             }
             Policy::Plugin(name) if self.is_trusted(now, name) => {
                 let name = name.clone();
@@ -252,6 +268,7 @@ impl CoordinatorMachine {
             let attempt = Attempt { epoch: self.config.epoch, sequence: self.next_attempt };
             self.next_attempt += 1;
             let load = load_of(batch.module, wanted);
+            batch.placed_jobs += 1;
             share.jobs.push(JobAttempt { job: key.in_app(pending.app), attempt });
             share.loads.push(load);
             job.state = JobState::Placed(Placement {
@@ -346,6 +363,7 @@ impl CoordinatorMachine {
             }
             !again
         });
+        keys.extend(self.reserved.remove(&(id, batch)).into_iter().flat_map(|pending| pending.keys));
         let Some(app) = self.apps.get_mut(&id) else { return Vec::new() };
         if let Some(waiting) = app.batches.get_mut(&batch) {
             waiting.told = None;
@@ -408,6 +426,9 @@ fn take_in(app: &mut App, request: &PlanRequest, module: Module) -> Intake {
             contents: request.contents.clone(),
             open_jobs: 0,
             told: None,
+            placed_jobs: 0,
+            samples: Samples::default(),
+            low: Low::default(),
         };
         app.batches.entry(request.batch).or_insert_with(new).open_jobs += added;
     }
@@ -416,9 +437,34 @@ fn take_in(app: &mut App, request: &PlanRequest, module: Module) -> Intake {
 
 /// What a job adds to the queue of its device.
 pub(super) fn load_of(module: Module, job: &QuestionJob) -> Load {
-    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a float cast saturates")]
-    let amount = (job.load as u64).clamp(1, MAX_LOAD);
-    Load { module, amount }
+    Load { module, amount: load_amount(job.load) }
+}
+
+#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a float cast saturates")]
+pub(super) const fn load_amount(load: f64) -> u64 {
+    let amount = load as u64;
+    if amount > MAX_LOAD {
+        MAX_LOAD
+    } else if amount == 0 {
+        1
+    } else {
+        amount
+    }
+}
+
+/// What an application told of a job's cost, by itself; see [`wanted`] for what it counts as in a batch.
+pub(super) fn told_load(cost: CostNs) -> f64 {
+    if cost == CostNs(0) { UNIT_LOAD } else { cost.0.min(MAX_LOAD) as f64 }
+}
+
+/// Puts what each job costs for each unit that its application told into a question.
+fn recall_told(app: &App, question: &mut Question, cost: impl Fn(JobIndex) -> f64) {
+    for wanted in &mut question.jobs {
+        let key = JobKey { task: question.task, index: wanted.index };
+        if let Some(job) = app.jobs.get(&key) {
+            wanted.load = told_load(job.cost) * cost(wanted.index);
+        }
+    }
 }
 
 /// The jobs of a batch in line that still wait, with their loads: a job of unknown cost counts as much as the mean of

@@ -148,6 +148,15 @@ impl Throughput {
         self.score * own.or(self.speed.value).unwrap_or(1.0)
     }
 
+    /// What the device is worth at a module was found out otherwise.
+    pub(super) fn set_rate(&mut self, modules: &Modules, module: Module, rate: f64) {
+        let speed = rate / (self.score * modules.scale(module));
+        if let Some(found) = self.modules.iter_mut().find(|found| found.module == module) {
+            found.speed.value = Some(speed);
+            found.speed.off_in_a_row = 0;
+        }
+    }
+
     /// How long what is queued takes, in nanoseconds.
     pub(super) fn queued_ns(&self, modules: &Modules) -> f64 {
         let queued = self.modules.iter().filter(|found| found.jobs > 0);
@@ -182,6 +191,12 @@ impl Throughput {
         let found = found.expect("what was added is kept until it is removed");
         found.queued -= u128::from(load.amount);
         found.jobs -= 1;
+    }
+
+    /// What is queued is another amount than was thought.
+    pub(super) fn rebook(&mut self, before: Load, amount: u64) {
+        self.remove(before);
+        self.add(Load { amount, ..before });
     }
 
     /// Learns from one completed job. Gives what it cost, in points of score times nanoseconds, which no change of the

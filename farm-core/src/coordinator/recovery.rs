@@ -224,6 +224,9 @@ impl CoordinatorMachine {
                 job.state = state;
                 app.waiting_jobs -= 1;
             }
+            if let (JobState::Placed(_), Some(batch)) = (state, app.batches.get_mut(&batch)) {
+                batch.placed_jobs += 1;
+            }
         }
         for node in touched {
             if let Some(node) = self.nodes.get_mut(&node) {

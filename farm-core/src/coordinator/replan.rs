@@ -274,9 +274,13 @@ impl CoordinatorMachine {
             return;
         }
         job.avoid = avoid;
+        let batch = job.batch;
         app.waiting_jobs += 1;
-        self.lost.entry((id.app, job.batch)).or_default().push(key);
+        self.lost.entry((id.app, batch)).or_default().push(key);
         self.release(id.app, key, before);
+        if matches!(before, JobState::Placed(_)) {
+            self.left_place(id.app, batch);
+        }
     }
 
     /// Takes what a job occupies off the books of its node.
@@ -298,9 +302,12 @@ impl CoordinatorMachine {
         let app = self.apps.get_mut(&id.app)?;
         let key = JobKey::of(id);
         let job = app.jobs.remove(&key)?;
-        if job.state == JobState::Waiting {
-            app.waiting_jobs -= 1;
+        match job.state {
+            JobState::Waiting => app.waiting_jobs -= 1,
+            JobState::Placed(_) => self.left_place(id.app, job.batch),
+            JobState::Executed { .. } => {}
         }
+        let app = self.apps.get_mut(&id.app)?;
         if let Some(batch) = app.batches.get_mut(&job.batch) {
             batch.open_jobs -= 1;
             if batch.open_jobs == 0 {

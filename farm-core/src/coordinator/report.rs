@@ -5,6 +5,7 @@ use std::time::Duration;
 use super::{
     CoordinatorMachine,
     model::{JobState, Placement},
+    placement::told_load,
     policy::Policy,
     rates::Load,
 };
@@ -153,8 +154,12 @@ impl CoordinatorMachine {
         let record = self.job_mut(job.job)?;
         let JobState::Placed(place) = record.state else { return None };
         record.state = JobState::Executed { node: id, device: place.device, attempt: job.attempt };
+        let batch = record.batch;
         let device = self.nodes.get_mut(&id)?.device_mut(place.device)?;
         device.drop_load(place.load);
+        let planned_jobs = device.planned_jobs;
+        self.left_place(job.job.app, batch);
+        self.device_has(planned_jobs, job.job.app, batch);
         Some(place.load)
     }
 
@@ -168,13 +173,21 @@ impl CoordinatorMachine {
         load: Load,
         device_time_ns: u64,
     ) {
+        let place = (id, device);
         let Some(device) = self.nodes.get_mut(&id).and_then(|node| node.device_mut(device)) else { return };
         let point_ns = device.completed(now, &mut self.modules, load, device_time_ns);
         let Some(app) = self.apps.get_mut(&job.app) else { return };
         app.device_time_ns = app.device_time_ns.saturating_add(device_time_ns);
         app.breaker.completed();
-        if app.policy == Policy::History {
-            self.history.note(&app.name, job.index, point_ns);
+        match app.policy {
+            Policy::Fcfs | Policy::Plugin(_) => {}
+            Policy::History => self.history.note(&app.name, job.index, point_ns),
+            Policy::Neighbours => {
+                let Some(record) = app.jobs.get(&JobKey::of(job)) else { return };
+                if let Some(batch) = app.batches.get_mut(&record.batch) {
+                    batch.samples.note(job.index, place, told_load(record.cost), device_time_ns);
+                }
+            }
         }
     }
 
