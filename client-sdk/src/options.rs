@@ -19,8 +19,9 @@ pub struct FarmOptions {
     /// Whether queued jobs may be moved between nodes to balance them. Costs a little traffic, and is worth it
     /// whenever devices or jobs are unequal.
     pub global_stealing: bool,
-    /// The coordinator's placement policy for this application's jobs: `fcfs`, `history` (costs of the same jobs of the
-    /// application's last task, longest first), or the name of a plug-in in the coordinator's folder.
+    /// The coordinator's placement policy for this application's jobs: `fcfs`, `neighbours` (costs by those of the jobs of
+    /// indices beside theirs), `history` (and by what the same jobs took in the application's last task), or the name of a
+    /// plug-in in the coordinator's folder.
     pub policy: String,
     /// Who the application is in a secured farm; without it, the farm has to be open.
     pub identity: Option<Identity>,

@@ -78,7 +78,8 @@ pub struct AppHello {
     /// moved to it in any case.
     pub global_stealing: bool,
     /// Name of the placement policy for its jobs: [`crate::coordinator::policy::FCFS`] (also when empty),
-    /// [`crate::coordinator::policy::HISTORY`], or a plug-in in the coordinator's folder.
+    /// [`crate::coordinator::policy::NEIGHBOURS`], [`crate::coordinator::policy::HISTORY`], or a plug-in in the coordinator's
+    /// folder.
     pub policy: String,
     /// Who the application was before its connection broke, if it comes back.
     pub resume: Option<(AppId, AppIncarnation)>,

@@ -86,7 +86,11 @@ fn app_hello(step: Step) -> AppHello {
         name: "app".to_owned(),
         weight: f64::from(step.three),
         global_stealing: step.three != 1,
-        policy: ["", "history", "plugin", "unknown"][usize::from(step.one)].to_owned(),
+        policy: match step.four % 3 {
+            0 => "neighbours",
+            _ => ["", "history", "plugin", "unknown"][usize::from(step.one)],
+        }
+        .to_owned(),
         resume: (step.two > 1).then(|| (AppId(step.two.into()), AppIncarnation(u32::from(step.four)))),
     }
 }

@@ -154,8 +154,8 @@ pub(crate) struct RenderArgs {
     /// Brightness of the PNG in stops.
     #[arg(long, default_value_t = 0.0, allow_negative_numbers = true, value_parser = stops)]
     pub exposure: f32,
-    /// How the coordinator spreads the jobs: fcfs, history, or the name of a plug-in of its own.
-    #[arg(long, value_name = "NAME", default_value = "fcfs")]
+    /// How the coordinator spreads the jobs: fcfs, neighbours, history, or the name of a plug-in of its own.
+    #[arg(long, value_name = "NAME", default_value = "neighbours")]
     pub policy: String,
     /// How progress is told.
     #[arg(long, value_enum, default_value_t = ProgressStyle::Auto)]
@@ -204,7 +204,7 @@ pub(crate) struct MiArgs {
     /// How many pairs the table holds; five a column without it.
     #[arg(long, value_name = "PAIRS")]
     pub top: Option<usize>,
-    /// How the coordinator spreads the jobs: fcfs, history, or the name of a plug-in of its own.
+    /// How the coordinator spreads the jobs: fcfs, neighbours, history, or the name of a plug-in of its own.
     #[arg(long, value_name = "NAME", default_value = "fcfs")]
     pub policy: String,
     /// How progress is told.

@@ -79,6 +79,12 @@ fn plugins() {
 }
 
 #[test]
+fn jobs_in_parts() {
+    let checks = sweep("parts", 0..250);
+    assert!(checks.executions > 0 && checks.steals > 0, "nothing went out in parts");
+}
+
+#[test]
 fn classes() {
     let Checks { yields, executions, .. } = sweep("classes", 0..250);
     assert!(yields > 0 && executions > 0, "no job made way");

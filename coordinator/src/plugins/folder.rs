@@ -6,7 +6,7 @@ use std::{
     path::{Path, PathBuf},
 };
 
-use farm_core::coordinator::policy::{FCFS, HISTORY};
+use farm_core::coordinator::policy::BUILT_IN;
 
 use crate::StartError;
 
@@ -31,7 +31,7 @@ pub(super) fn scan(folder: &Path) -> Result<BTreeMap<String, PathBuf>, StartErro
         }
         let name = path.file_stem().and_then(|stem| stem.to_str()).filter(|name| is_name(name));
         let name = name.ok_or_else(|| fault(&path, &"its name is not 1 to 64 of a-z, 0-9, '_', '-'"))?;
-        if [FCFS, HISTORY].contains(&name) {
+        if BUILT_IN.contains(&name) {
             return Err(fault(&path, &"has the name of a built-in policy"));
         }
         let resolved = path.canonicalize().map_err(|error| fault(&path, &error))?;

@@ -9,12 +9,12 @@ use super::{
     CoordinatorMachine, NodeState,
     model::{App, Batch, Job, JobState, Node, Pending, Placement},
     neighbours::Samples,
-    policy::{Choice, Fcfs, LongestFirst, PlacementPolicy, Policy, Question, QuestionDevice, QuestionJob},
+    policy::{Choice, Fcfs, PlacementPolicy, Policy, Question, QuestionDevice, QuestionJob},
     rates::{Load, Module},
     reserve::Low,
 };
 use crate::{
-    id::{AppId, Attempt, BatchId, DeviceIndex, JobAttempt, JobIndex, JobKey, NodeId, TaskId},
+    id::{AppId, Attempt, BatchId, DeviceIndex, JobAttempt, JobKey, NodeId, TaskId},
     message::{CoordinatorToApp, CostNs, DevicePlan, NodePlan, Plan, PlanRequest, WaitReason},
     time::Instant,
 };
@@ -146,25 +146,18 @@ impl CoordinatorMachine {
     }
 
     fn place_batch(&mut self, now: Instant, pending: Pending) {
-        let estimates = self.learn_from_neighbours(&pending);
+        let estimates = self.learn(&pending);
         let Some((pending, mut question)) = self.question(now, pending) else { return };
         let Some(app) = self.apps.get(&pending.app) else { return };
-        if let Some(estimates) = &estimates {
-            recall_told(app, &mut question, |index| estimates.cost(index));
-        }
         let choices = match &app.policy {
             Policy::Fcfs => Fcfs.place(&question),
-            Policy::History => {
-                if let Some(batch) = app.batches.get(&pending.batch) {
-                    let load = |point_ns| self.modules.load(batch.module, point_ns);
-                    self.history.recall(&app.name, load, &mut question.jobs);
+            Policy::History | Policy::Neighbours => {
+                self.estimate(&pending, &mut question, estimates.as_ref());
+                // What lost its place does not wait for a part.
+                if pending.answers.is_some() {
+                    return self.place_part(now, &pending, question, estimates.is_some());
                 }
-                LongestFirst.place(&question)
-            }
-            // What lost its place need not wait for a part.
-            Policy::Neighbours if pending.answers.is_none() => Fcfs.place(&question),
-            Policy::Neighbours => {
-                return self.place_part(now, &pending, question, estimates.as_ref());
+                Fcfs.place(&question)
             }
             Policy::Plugin(name) if self.is_trusted(now, name) => {
                 let name = name.clone();
@@ -455,16 +448,6 @@ pub(super) const fn load_amount(load: f64) -> u64 {
 /// What an application told of a job's cost, by itself; see [`wanted`] for what it counts as in a batch.
 pub(super) fn told_load(cost: CostNs) -> f64 {
     if cost == CostNs(0) { UNIT_LOAD } else { cost.0.min(MAX_LOAD) as f64 }
-}
-
-/// Puts what each job costs for each unit that its application told into a question.
-fn recall_told(app: &App, question: &mut Question, cost: impl Fn(JobIndex) -> f64) {
-    for wanted in &mut question.jobs {
-        let key = JobKey { task: question.task, index: wanted.index };
-        if let Some(job) = app.jobs.get(&key) {
-            wanted.load = told_load(job.cost) * cost(wanted.index);
-        }
-    }
 }
 
 /// The jobs of a batch in line that still wait, with their loads: a job of unknown cost counts as much as the mean of

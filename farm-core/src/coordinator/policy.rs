@@ -14,11 +14,14 @@ use crate::id::{AppId, DeviceIndex, JobIndex, NodeId, TaskId};
 /// Name of the policy that takes jobs in their order and each to the device that would finish it first.
 pub const FCFS: &str = "fcfs";
 
-/// Name of the policy that knows what the same job took in the application's last task.
+/// Name of the policy that also knows what the same job took in the application's last task.
 pub const HISTORY: &str = "history";
 
 /// Name of the policy that knows what a job takes by what the jobs of indices beside it took.
 pub const NEIGHBOURS: &str = "neighbours";
+
+/// Names that no plug-in may have.
+pub const BUILT_IN: [&str; 3] = [FCFS, NEIGHBOURS, HISTORY];
 
 /// One question to a plug-in, never reused in one life of the coordinator.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
@@ -89,6 +92,14 @@ impl Policy {
             HISTORY => Self::History,
             NEIGHBOURS => Self::Neighbours,
             name => Self::Plugin(name.to_owned()),
+        }
+    }
+
+    /// Whether it learns from the jobs of a batch what the others cost, and lets them go out in parts.
+    pub(super) const fn learns(&self) -> bool {
+        match self {
+            Self::Fcfs | Self::Plugin(_) => false,
+            Self::History | Self::Neighbours => true,
         }
     }
 }
@@ -320,14 +331,10 @@ impl History {
         past.point_ns[index] = point_ns as f32;
     }
 
-    /// Puts what is known in the place of what was estimated (temporal coherence: thesis 5.6.3, of fly-throughs).
-    pub(super) fn recall(&self, app: &str, load: impl Fn(f64) -> f64, jobs: &mut [QuestionJob]) {
-        let Some(past) = self.by_name.get(app) else { return };
-        for job in jobs {
-            let known = usize::try_from(job.index.0).ok().and_then(|index| past.point_ns.get(index));
-            if let Some(&point_ns) = known.filter(|point_ns| **point_ns > 0.0) {
-                job.load = load(point_ns.into());
-            }
-        }
+    /// What a job took the last time, in points of score times nanoseconds (temporal coherence: thesis 5.6.3, of fly-throughs).
+    pub(super) fn recall(&self, app: &str, index: JobIndex) -> Option<f64> {
+        let index = usize::try_from(index.0).ok()?;
+        let point_ns = self.by_name.get(app)?.point_ns.get(index)?;
+        (*point_ns > 0.0).then(|| (*point_ns).into())
     }
 }

@@ -6,7 +6,7 @@ use super::{
     CoordinatorMachine, Effect, NodeState,
     breaker::Breaker,
     model::{App, Node, Peer},
-    policy::{FCFS, HISTORY, Policy},
+    policy::{BUILT_IN, Policy},
     replan::Blame,
 };
 use crate::{
@@ -160,7 +160,7 @@ impl CoordinatorMachine {
             && !self.config.plugins.contains(name)
         {
             let known: Vec<&str> =
-                [FCFS, HISTORY].into_iter().chain(self.config.plugins.iter().map(String::as_str)).collect();
+                BUILT_IN.into_iter().chain(self.config.plugins.iter().map(String::as_str)).collect();
             return Err(format!(
                 "placement policy `{name}` is not known here; there are {}",
                 known.join(", ")

@@ -5,9 +5,9 @@ use std::time::Duration;
 use super::{
     CoordinatorMachine,
     model::{JobState, Placement},
-    placement::told_load,
     policy::Policy,
     rates::Load,
+    reserve::before,
 };
 use crate::{
     id::{DeviceIndex, JobAttempt, JobId, JobKey, NodeId},
@@ -179,15 +179,15 @@ impl CoordinatorMachine {
         let Some(app) = self.apps.get_mut(&job.app) else { return };
         app.device_time_ns = app.device_time_ns.saturating_add(device_time_ns);
         app.breaker.completed();
-        match app.policy {
-            Policy::Fcfs | Policy::Plugin(_) => {}
-            Policy::History => self.history.note(&app.name, job.index, point_ns),
-            Policy::Neighbours => {
-                let Some(record) = app.jobs.get(&JobKey::of(job)) else { return };
-                if let Some(batch) = app.batches.get_mut(&record.batch) {
-                    batch.samples.note(job.index, place, told_load(record.cost), device_time_ns);
-                }
-            }
+        if app.policy.learns()
+            && let Some(record) = app.jobs.get(&JobKey::of(job))
+            && let Some(batch) = app.batches.get_mut(&record.batch)
+        {
+            let before = before(&self.history, &app.policy, &app.name, job.index, record.cost);
+            batch.samples.note(job.index, place, before, device_time_ns);
+        }
+        if app.policy == Policy::History {
+            self.history.note(&app.name, job.index, point_ns);
         }
     }
 

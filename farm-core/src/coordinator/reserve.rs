@@ -1,4 +1,4 @@
-//! Batches of the policy `neighbours`: their jobs go out in parts, each when devices are about to run out of the one before, and
+//! Batches of the policies that learn, `neighbours` and `history`: their jobs go out in parts, each when devices are about to run out of the one before, and
 //! the last few for each device at once, packed by what the jobs beside them took.
 //!
 //! Jobs go out in an order that is even over the batch at any time. So what has run tells of all that has not, each device
@@ -10,10 +10,11 @@ use super::{
     model::{Device, JobState, Pending},
     neighbours::{Estimates, Place},
     placement::{load_amount, told_load},
-    policy::{LongestFirst, Packed, PlacementPolicy as _, Policy, Question},
+    policy::{History, LongestFirst, Packed, PlacementPolicy as _, Policy, Question},
 };
 use crate::{
     id::{AppId, BatchId, JobIndex, JobKey},
+    message::CostNs,
     time::Instant,
 };
 
@@ -35,6 +36,13 @@ const LOW: f64 = 1.5;
 /// ticket are messages on a network. Where jobs are shorter, all of the above are as many times more.
 const LEAD_NS: f64 = 20e6;
 
+/// A job that seems to take more than so many times the mean does not wait for its turn in the even order: alone it could last
+/// longer than all the others of the last part.
+const DEAR: f64 = 2.0;
+
+/// A remembered point of score counts as this much load, as if devices of score 1,000 had speed 1.0. Only ratios count.
+const LOAD_PER_POINT_NS: f64 = 1e-3;
+
 /// When the next part of a batch is due.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Low {
@@ -46,8 +54,8 @@ pub(super) struct Low {
 
 impl CoordinatorMachine {
     /// What the completed jobs of a batch tell of the others. The books are kept by it from now on.
-    pub(super) fn learn_from_neighbours(&mut self, pending: &Pending) -> Option<Estimates> {
-        let app = self.apps.get(&pending.app).filter(|app| app.policy == Policy::Neighbours)?;
+    pub(super) fn learn(&mut self, pending: &Pending) -> Option<Estimates> {
+        let app = self.apps.get(&pending.app).filter(|app| app.policy.learns())?;
         let batch = app.batches.get(&pending.batch)?;
         let (task, module) = (batch.task, batch.module);
         let rate = |place: Place| {
@@ -64,11 +72,30 @@ impl CoordinatorMachine {
             let JobState::Placed(place) = &mut job.state else { continue };
             let device = self.nodes.get_mut(&place.node).and_then(|node| node.device_mut(place.device));
             let Some(device) = device.filter(|_| job.batch == pending.batch) else { continue };
-            let amount = load_amount(told_load(job.cost) * estimates.cost(key.index));
+            let before = before(&self.history, &app.policy, &app.name, key.index, job.cost);
+            let amount = load_amount(before * estimates.cost(key.index));
             device.throughput.rebook(place.load, amount);
             place.load.amount = amount;
         }
         Some(estimates)
+    }
+
+    /// Puts what jobs seem to cost into a question: before any other ran, what they took the last time.
+    pub(super) fn estimate(&self, pending: &Pending, question: &mut Question, estimates: Option<&Estimates>) {
+        let Some(app) = self.apps.get(&pending.app) else { return };
+        let Some(batch) = app.batches.get(&pending.batch) else { return };
+        for wanted in &mut question.jobs {
+            let Some(job) = app.jobs.get(&JobKey { task: batch.task, index: wanted.index }) else { continue };
+            let recalled = recall(&self.history, &app.policy, &app.name, wanted.index);
+            match (estimates, recalled) {
+                (Some(estimates), _) => {
+                    let before = before(&self.history, &app.policy, &app.name, wanted.index, job.cost);
+                    wanted.load = before * estimates.cost(wanted.index);
+                }
+                (None, Some(point_ns)) => wanted.load = self.modules.load(batch.module, point_ns),
+                (None, None) => {}
+            }
+        }
     }
 
     /// Gives the next part of a batch its places, and keeps the rest.
@@ -77,14 +104,15 @@ impl CoordinatorMachine {
         now: Instant,
         pending: &Pending,
         mut question: Question,
-        estimates: Option<&Estimates>,
+        measured: bool,
     ) {
         // Jobs of other batches of the module may have been of another size.
-        let at_once = if estimates.is_some() { jobs_at_once(&question) } else { 1.0 };
+        let at_once = if measured { jobs_at_once(&question) } else { 1.0 };
         let devices = question.devices.len() as f64 * at_once;
+        let mean_load = mean_load(&question);
         let jobs = &mut question.jobs;
-        jobs.sort_by_key(|job| evenly(job.index));
-        let rest = jobs.split_off(part(jobs.len(), devices, estimates.is_some()));
+        jobs.sort_by_key(|job| (job.load <= DEAR * mean_load, evenly(job.index)));
+        let rest = jobs.split_off(part(jobs.len(), devices, measured));
         let last = rest.is_empty();
         let choices = if last { Packed.place(&question) } else { LongestFirst.place(&question) };
         self.enter(now, pending, &question, &choices);
@@ -141,10 +169,24 @@ fn part(waiting: usize, devices: f64, measured: bool) -> usize {
 
 /// How many jobs a device should have in the place of one, because they are short.
 fn jobs_at_once(question: &Question) -> f64 {
-    let load: f64 = question.jobs.iter().map(|job| job.load).sum();
     let time_per_load: f64 = question.devices.iter().map(|device| device.time_per_load).sum();
-    let job_ns = load / question.jobs.len() as f64 * time_per_load / question.devices.len() as f64;
+    let job_ns = mean_load(question) * time_per_load / question.devices.len() as f64;
     (LEAD_NS / job_ns).max(1.0)
+}
+
+fn mean_load(question: &Question) -> f64 {
+    question.jobs.iter().map(|job| job.load).sum::<f64>() / question.jobs.len() as f64
+}
+
+/// What a job was taken for before its batch ran: what samples are measured against.
+pub(super) fn before(history: &History, policy: &Policy, app: &str, index: JobIndex, told: CostNs) -> f64 {
+    let recalled = recall(history, policy, app, index);
+    recalled.map_or_else(|| told_load(told), |point_ns| point_ns * LOAD_PER_POINT_NS)
+}
+
+/// What it took the last time, under the policy that remembers, in points of score times nanoseconds.
+fn recall(history: &History, policy: &Policy, app: &str, index: JobIndex) -> Option<f64> {
+    if *policy == Policy::History { history.recall(app, index) } else { None }
 }
 
 /// Jobs in the order of these numbers are even over their batch at any time: multiples of the golden ratio, modulo 1.

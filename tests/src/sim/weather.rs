@@ -3,6 +3,7 @@
 use std::{collections::BTreeSet, time::Duration};
 
 use farm_core::{
+    coordinator::policy::{HISTORY, NEIGHBOURS},
     id::{DeviceIndex, TaskId},
     ledger::Event,
     time::Instant,
@@ -11,6 +12,7 @@ use rand::{Rng, SeedableRng, rngs::SmallRng};
 
 use super::{
     faults::Fault,
+    hosts::PLUGIN,
     network::{Distances, Duplicates, Proc},
     world::{Happening, MILLISECOND, Setup, World},
 };
@@ -73,6 +75,8 @@ pub(super) enum Kind {
     Classes,
     /// Applications choose a plug-in. Not in [`Self::ALL`]: it has a scenario of its own, in every seed.
     Plugins,
+    /// Applications choose a policy that learns. As `Plugins`.
+    Parts,
 }
 
 impl Kind {
@@ -121,7 +125,8 @@ impl Weather {
         // Another generator than the world's: what happens in it does not depend on how it was drawn.
         let mut rng = SmallRng::seed_from_u64(!seed);
         let density = [0.1, 0.3, 0.6][rng.random_range(0..3)];
-        let (plugin, interactive) = (kinds.contains(&Kind::Plugins), kinds.contains(&Kind::Classes));
+        let policy = policy_of(seed, kinds);
+        let interactive = kinds.contains(&Kind::Classes);
         let kinds: BTreeSet<Kind> = kinds.iter().copied().filter(|_| rng.random_bool(density)).collect();
         let has = |kind| kinds.contains(&kind);
         let workers = rng.random_range(2..=5);
@@ -137,7 +142,7 @@ impl Weather {
             max_jobs: if rng.random_bool(0.3) { 40 } else { 10_000 },
             global_stealing: has(Kind::Stealing),
             interactive,
-            plugin,
+            policy,
             score_error: if has(Kind::Scores) { 3.0 } else { 1.0 },
             skewed_clocks: has(Kind::Skew),
             distances: if has(Kind::Distance) { Distances::Mixed } else { Distances::Lan },
@@ -240,8 +245,19 @@ impl Weather {
             | Kind::Scores
             | Kind::Stealing
             | Kind::Classes
-            | Kind::Plugins => return None,
+            | Kind::Plugins
+            | Kind::Parts => return None,
         };
         Some(Happening::Fault(fault))
+    }
+}
+
+/// What the applications of a seed choose.
+fn policy_of(seed: u64, kinds: &[Kind]) -> &'static str {
+    match (kinds.contains(&Kind::Plugins), kinds.contains(&Kind::Parts)) {
+        (true, _) => PLUGIN,
+        (false, true) if seed.is_multiple_of(3) => HISTORY,
+        (false, true) => NEIGHBOURS,
+        (false, false) => "",
     }
 }

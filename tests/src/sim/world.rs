@@ -182,8 +182,8 @@ pub struct Setup {
     pub global_stealing: bool,
     /// Every other application's jobs are interactive.
     pub interactive: bool,
-    /// The applications choose a plug-in, which answers well, wrongly, late or never.
-    pub plugin: bool,
+    /// What the applications choose; a plug-in answers well, wrongly, late or never.
+    pub policy: &'static str,
     /// Announced scores are wrong by up to this factor, either way.
     pub score_error: f64,
     /// Each process has a clock of its own.
@@ -207,7 +207,7 @@ impl Setup {
             app_lease_ms: SHORT_APP_LEASE_MS,
             global_stealing: false,
             interactive: false,
-            plugin: false,
+            policy: "",
             score_error: 1.0,
             skewed_clocks: false,
             distances: Distances::Lan,

@@ -15,7 +15,6 @@ use farm_core::{
     time::Instant,
 };
 
-use super::coordinator::PLUGIN;
 use crate::sim::{
     clock::Clock,
     faults::Fault,
@@ -85,7 +84,7 @@ struct Submission {
 
 impl AppHost {
     pub(in crate::sim) fn new(index: usize, setup: &Setup, clock: Clock) -> Self {
-        let (global_stealing, policy) = (setup.global_stealing, if setup.plugin { PLUGIN } else { "" });
+        let (global_stealing, policy) = (setup.global_stealing, setup.policy);
         Self {
             index,
             ledger: Ledger::new(hello(index, global_stealing, policy, None)),

@@ -5,7 +5,7 @@ mod app;
 mod coordinator;
 mod worker;
 
-pub(super) use self::coordinator::Store;
+pub(super) use self::coordinator::{PLUGIN, Store};
 pub use self::{
     app::{AppHost, Ending},
     worker::WorkerHost,
