@@ -13,12 +13,12 @@ use bytes::Bytes;
 use farm_core::{id::JobAttempt, message::JobFailure};
 
 use super::wire::{self, FromExecutor, Output};
-use crate::device::Payload;
+use crate::device::{Payload, size_of};
 
 /// A result of this many bytes is large: writing it takes about as long as waking a thread does a hundred times.
-const LARGE_BYTES: usize = 1 << 20;
+const LARGE_BYTES: u64 = 1 << 20;
 /// Bytes of large results that wait, at most, apart from one; whoever brings more waits.
-const MAX_WAITING_BYTES: usize = 512 << 20;
+const MAX_WAITING_BYTES: u64 = 512 << 20;
 
 /// Says things in the order in which they come.
 pub(super) struct Mouth {
@@ -33,7 +33,7 @@ struct Outgoing {
     /// The thread writes: nobody else may.
     writing: bool,
     waiting: VecDeque<Said>,
-    waiting_bytes: usize,
+    waiting_bytes: u64,
 }
 
 enum Said {
@@ -147,8 +147,4 @@ fn result(job: JobAttempt, device_time_ns: u64, sections: Vec<Bytes>) -> (Vec<u8
     let lengths = sections.iter().map(|section| section.len() as u64).collect();
     let outcome = Ok(Output { sections: lengths, digest });
     (wire::encode(&FromExecutor::Finished { job, device_time_ns, outcome }), sections)
-}
-
-fn size_of(sections: &[Bytes]) -> usize {
-    sections.iter().map(Bytes::len).sum()
 }
