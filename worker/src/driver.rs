@@ -287,6 +287,7 @@ impl Driver {
             | CoordinatorToNode::Located { .. }
             | CoordinatorToNode::Evict { .. }
             | CoordinatorToNode::Drain
+            | CoordinatorToNode::SayInventory
             | CoordinatorToNode::HeartbeatAck { .. } => {}
         }
         self.tell(Event::FromCoordinator(message));

@@ -12,6 +12,7 @@ mod breaker;
 mod consult;
 mod contents;
 mod invariants;
+mod inventory;
 mod lease;
 mod model;
 mod placement;
@@ -483,6 +484,8 @@ impl CoordinatorMachine {
             }
             NodeToCoordinator::Locate(content) => self.locate(now, node, content),
             NodeToCoordinator::CacheChanged { held, gone } => self.cache_changed(now, node, &held, &gone),
+            NodeToCoordinator::Holding(held) => self.holding(node, held),
+            NodeToCoordinator::Inventory(held) => self.inventory(now, node, &held),
             NodeToCoordinator::Goodbye => {
                 self.close(link);
                 self.node_leaves(now, node);

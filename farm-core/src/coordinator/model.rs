@@ -6,6 +6,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use super::{
     NodeState,
     breaker::Breaker,
+    inventory::Missing,
     policy::Policy,
     rates::{Load, Module, Modules, Throughput},
     recovery::Brought,
@@ -167,8 +168,10 @@ pub(super) struct Node {
     pub(super) state: NodeState,
     /// Gave a job back while not draining: gets nothing new until then.
     pub(super) full_until: Option<Instant>,
-    /// Jobs that a hello's inventory lacked because they were in transit, or so it seemed: looked at once more then.
-    pub(super) recheck: Option<Recheck>,
+    /// Jobs that it should hold and did not, because they were in transit, or so it seemed.
+    pub(super) missing: BTreeMap<JobId, Missing>,
+    /// Then it is asked for them again.
+    pub(super) ask_at: Option<Instant>,
     /// Jobs placed or executed here.
     pub(super) jobs: BTreeSet<JobId>,
     /// What it holds of earlier coordinators' plans, and its applications have not asked for yet.
@@ -196,7 +199,8 @@ impl Node {
             last_heard: now,
             state: NodeState::Alive,
             full_until: None,
-            recheck: None,
+            missing: BTreeMap::new(),
+            ask_at: None,
             jobs: BTreeSet::new(),
             brought: BTreeMap::new(),
             contents: BTreeSet::new(),
@@ -260,13 +264,6 @@ impl Node {
         let first = standing.min_by(|(_, one), (_, other)| free_at(one).total_cmp(&free_at(other)));
         first.map(|(index, _)| DeviceIndex(index))
     }
-}
-
-/// Attempts whose whereabouts are in doubt until a deadline.
-#[derive(Debug)]
-pub(super) struct Recheck {
-    pub(super) at: Instant,
-    pub(super) jobs: Vec<(JobId, Attempt)>,
 }
 
 /// A device of a node.

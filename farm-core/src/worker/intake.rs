@@ -72,18 +72,11 @@ impl WorkerMachine {
     }
 
     pub(super) fn drop_jobs_of(&mut self, app: AppId) {
-        let jobs: Vec<JobAttempt> = self
-            .jobs
-            .range(JobId::range_of(app))
-            .map(|(&job, held)| JobAttempt { job, attempt: held.attempt })
-            .collect();
-        jobs.into_iter().for_each(|job| self.drop_job(job));
+        self.inventory_of(app).into_iter().for_each(|job| self.drop_job(job));
     }
 
     pub(super) fn drop_everything(&mut self) {
-        let jobs: Vec<JobAttempt> =
-            self.jobs.iter().map(|(&job, held)| JobAttempt { job, attempt: held.attempt }).collect();
-        jobs.into_iter().for_each(|job| self.drop_job(job));
+        self.inventory().into_iter().for_each(|job| self.drop_job(job));
     }
 
     pub(super) fn report_failure(

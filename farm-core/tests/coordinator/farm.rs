@@ -37,6 +37,8 @@ pub(crate) struct Farm {
     pub(crate) speculative: bool,
     /// By node, in order.
     pub(crate) cancelled: Vec<(u64, JobAttempt)>,
+    /// Nodes that were asked what they hold.
+    pub(crate) asked: Vec<u64>,
     /// Nodes that were told where to fetch, and from which address; none is the application.
     pub(crate) located: Vec<(u64, Option<String>)>,
 }
@@ -57,6 +59,7 @@ impl Farm {
             stopped: Vec::new(),
             speculative: false,
             cancelled: Vec::new(),
+            asked: Vec::new(),
             located: Vec::new(),
         };
         for (node, &score) in (1..).zip(scores) {
@@ -130,6 +133,7 @@ impl Farm {
                 Effect::ToNode { link, message: CoordinatorToNode::Cancel { jobs } } => {
                     self.cancelled.extend(jobs.into_iter().map(|job| (link.0, job)));
                 }
+                Effect::ToNode { link, message: CoordinatorToNode::SayInventory } => self.asked.push(link.0),
                 Effect::ToNode { link, message: CoordinatorToNode::Located { peer, .. } } => {
                     self.located.push((link.0, peer.map(|peer| peer.addresses.concat())));
                 }
@@ -194,6 +198,13 @@ impl Farm {
             cache: Some(CacheFigures::default()),
         };
         self.handle(Event::FromNode { link: LinkId(node), message })
+    }
+
+    /// A node says all that it holds; gives the jobs that are planned because of it.
+    pub(crate) fn inventory(&mut self, node: u64, held: &[JobAttempt]) -> Vec<JobAttempt> {
+        let message = NodeToCoordinator::Inventory(held.to_vec());
+        let planned = self.handle(Event::FromNode { link: LinkId(node), message });
+        planned.into_values().flatten().collect()
     }
 
     pub(crate) fn leaves(&mut self, node: u64) -> BTreeMap<u64, Vec<JobAttempt>> {

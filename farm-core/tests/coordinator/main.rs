@@ -6,6 +6,7 @@ mod breaker;
 mod farm;
 mod guard;
 mod hearing;
+mod inventory;
 mod losses;
 mod policies;
 mod speculation;

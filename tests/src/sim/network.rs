@@ -61,6 +61,27 @@ pub enum Message {
     NodeToApp(NodeToApp),
 }
 
+/// The first shows it, two more are waited for, and the answer comes late at worst.
+const COMPARISONS_UNTIL_MADE_UP_FOR: u32 = 4;
+
+/// Whether comparisons of what is held make up for the loss of a message on a connection that stands. There are no such losses;
+/// what looks like one would be a mistake of ours.
+const fn can_be_made_up_for(message: &Message) -> bool {
+    match message {
+        Message::AppToNode(message) => {
+            matches!(message, AppToNode::Jobs(_) | AppToNode::Acks(_) | AppToNode::Cancel(_))
+        }
+        Message::NodeToCoordinator(message) => {
+            matches!(message, NodeToCoordinator::Report { .. } | NodeToCoordinator::Retracted { .. })
+        }
+        Message::CoordinatorToNode(message) => {
+            matches!(message, CoordinatorToNode::Cancel { .. } | CoordinatorToNode::Retract { .. })
+        }
+        Message::CoordinatorToApp(message) => matches!(message, CoordinatorToApp::Plan(_)),
+        Message::AppToCoordinator(_) | Message::NodeToApp(_) => false,
+    }
+}
+
 /// Which messages may arrive twice.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Duplicates {
@@ -201,10 +222,21 @@ impl World {
     pub(super) fn send(&mut self, from: Proc, id: LinkId, message: Message) {
         self.audit_said(&message);
         self.excuse(&message);
+        if self.lost_one_in > 0 && can_be_made_up_for(&message) && self.rng.random_ratio(1, self.lost_one_in)
+        {
+            return self.lose(id);
+        }
         let doubled = self.duplicates.one_in(&message).is_some_and(|one_in| self.rng.random_ratio(1, one_in));
         if !doubled || self.send_once(from, id, message.clone()) {
             self.send_once(from, id, message);
         }
+    }
+
+    /// A message is lost, until a comparison shows it, and a second look that it was not merely late.
+    fn lose(&mut self, id: LinkId) {
+        let Some([one, other]) = self.links.get(&id).map(Link::ends) else { return };
+        let noticed = self.now.after(self.setup.liveness.compare_every() * COMPARISONS_UNTIL_MADE_UP_FOR);
+        self.audit.disturbed(noticed, one, other);
     }
 
     /// Puts a message on its way. False if the connection carries none.

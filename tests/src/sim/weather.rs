@@ -35,6 +35,8 @@ pub(super) enum Kind {
     Distance,
     /// Messages arrive twice.
     Doubles,
+    /// Messages are lost on connections that stand. As `Plugins`.
+    Losses,
     /// Workers are killed and started again.
     Restarts,
     /// Workers are killed for good.
@@ -122,7 +124,11 @@ impl Weather {
         let mut rng = SmallRng::seed_from_u64(!seed);
         let density = [0.1, 0.3, 0.6][rng.random_range(0..3)];
         let (plugin, interactive) = (kinds.contains(&Kind::Plugins), kinds.contains(&Kind::Classes));
-        let kinds: BTreeSet<Kind> = kinds.iter().copied().filter(|_| rng.random_bool(density)).collect();
+        let mut drawn: BTreeSet<Kind> = kinds.iter().copied().filter(|_| rng.random_bool(density)).collect();
+        if kinds.contains(&Kind::Losses) {
+            drawn.insert(Kind::Losses);
+        }
+        let kinds = drawn;
         let has = |kind| kinds.contains(&kind);
         let workers = rng.random_range(2..=5);
         let speeds = |rng: &mut SmallRng| {
@@ -168,6 +174,9 @@ impl Weather {
         }
         if self.has(Kind::Doubles) {
             world.duplicates = Duplicates::Any(self.rng.random_range(2..20));
+        }
+        if self.has(Kind::Losses) {
+            world.lost_one_in = self.rng.random_range(2..20);
         }
         for kind in self.kinds.clone() {
             for _ in 0..self.rng.random_range(1..4) {
@@ -233,6 +242,7 @@ impl Weather {
             }
             Kind::Distance
             | Kind::Doubles
+            | Kind::Losses
             | Kind::Poison
             | Kind::Crashes
             | Kind::Fetches

@@ -253,6 +253,8 @@ pub struct World {
     /// From whom to whom nothing gets through, and nobody is told.
     pub(super) blocked: BTreeSet<(Proc, Proc)>,
     pub(super) duplicates: Duplicates,
+    /// One in this many of the messages that comparisons make up for is lost; none if zero.
+    pub(super) lost_one_in: u32,
     pub(super) distances: Distances,
     pub(super) setup: Setup,
     pub(super) store: Store,
@@ -272,7 +274,13 @@ pub struct World {
 
 /// A tenth of what the design has, so that a run of seconds sees each silence.
 const fn short_liveness() -> message::Liveness {
-    message::Liveness { heartbeat_ms: 100, suspect_ms: 300, dead_ms: 1_000, reconnect_ms: 400 }
+    message::Liveness {
+        heartbeat_ms: 100,
+        suspect_ms: 300,
+        dead_ms: 1_000,
+        reconnect_ms: 400,
+        compare_ms: 500,
+    }
 }
 
 impl World {
@@ -294,6 +302,7 @@ impl World {
             cuts: BTreeSet::new(),
             blocked: BTreeSet::new(),
             duplicates: Duplicates::Never,
+            lost_one_in: 0,
             distances: setup.distances,
             store,
             coordinator_up: true,
