@@ -93,6 +93,19 @@ pub enum Happening {
         /// In which life.
         session: NodeSession,
     },
+    /// An application's call of a node is repeated if it has not been answered.
+    CallAgain {
+        /// The application.
+        app: usize,
+        /// In which life.
+        life: u32,
+        /// The node.
+        node: NodeId,
+        /// In which life.
+        session: NodeSession,
+        /// The worker that it is.
+        worker: usize,
+    },
     /// A process dials the coordinator.
     Dial {
         /// Who.
@@ -150,7 +163,8 @@ impl Happening {
             | Self::Closed { .. }
             | Self::NotOpened { .. }
             | Self::Dial { .. } => true,
-            Self::Worker { .. }
+            Self::CallAgain { .. }
+            | Self::Worker { .. }
             | Self::JobDone { .. }
             | Self::App { .. }
             | Self::PluginAnswers { .. }
@@ -511,8 +525,12 @@ impl World {
             Happening::Closed { link, to, life } => self.told_closed(link, to, life),
             Happening::NotOpened { app, life, node, session } => {
                 if self.apps[app].life == life {
+                    self.apps[app].dialling.remove(&(node, session));
                     self.app_event(app, ledger::Event::NodeLost { node, session });
                 }
+            }
+            Happening::CallAgain { app, life, node, session, worker } => {
+                self.call_again(app, life, node, session, worker);
             }
             Happening::Dial { proc, life } => self.dial_coordinator(proc, life),
             Happening::Worker { worker, life, event } => {
