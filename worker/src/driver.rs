@@ -455,7 +455,7 @@ impl Driver {
     }
 
     fn fetch(&mut self, content: Content, from: Provider) {
-        if self.contents.pin(content.hash) {
+        if self.contents.pin(content) {
             self.found.push(Event::ContentReady(content.hash));
             return;
         }

@@ -2,12 +2,14 @@
 
 use super::{
     Effect, WorkerMachine,
+    content::Misnamed,
     drain::Drain,
     job::{HeldJob, HeldState, Spooled},
 };
 use crate::{
     id::{AppId, DeviceIndex, JobAttempt, JobId, LinkId},
     message::{Executed, JobFailure, JobTicket, JobTrace},
+    program::Content,
     time::Instant,
 };
 
@@ -44,7 +46,16 @@ impl WorkerMachine {
             self.refuse(now, device, &ticket, failure);
             return;
         }
-        self.hold(now, link, device, ticket);
+        match self.misnamed(&ticket.contents) {
+            None => self.hold(now, link, device, ticket),
+            Some(Misnamed::Certainly(content)) => {
+                let Content { hash, size_bytes } = content;
+                let reason = format!("content {hash} has not the {size_bytes} B that it is said to have");
+                self.refuse(now, device, &ticket, JobFailure::InvalidProgram(reason));
+            }
+            // Who is right will show when it comes; elsewhere it may be known.
+            Some(Misnamed::Perhaps) => self.give_back_ticket(now, ticket.job, ticket.device),
+        }
     }
 
     /// Takes a job out, whatever it is doing, without a word to anybody but the driver.
