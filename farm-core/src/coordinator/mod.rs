@@ -5,12 +5,14 @@
 //!
 //! Split by event family: `registry` (who is there), `placement` (where jobs go, by a `policy`; `consult` asks plug-ins),
 //! `report` (what ended), `replan` (what was lost), `steal` (what moves between nodes), `speculate` (what runs twice at the tail),
-//! `breaker` (which application is stopped), `lease` (who is silent), `contents` (who has and brings which data), `status` (what
-//! operators see), `timeline` (what ran when and where). `model` holds the state they share, `rates` what devices are worth.
+//! `breaker` (which application is stopped), `lease` (who is silent), `contents` (who has and brings which data), `durable` (what
+//! outlives it), `status` (what operators see), `timeline` (what ran when and where). `model` holds the state they share, `rates`
+//! what devices are worth.
 
 mod breaker;
 mod consult;
 mod contents;
+pub mod durable;
 mod invariants;
 mod inventory;
 mod lease;
@@ -34,6 +36,7 @@ use serde::{Deserialize, Serialize};
 use self::{
     consult::{Asked, PluginFaults},
     contents::Spreads,
+    durable::{Durable, Keep, Restored},
     model::{App, Node, Peer, Pending, Placement},
     policy::{Choice, History, Question, QuestionId},
     rates::Modules,
@@ -66,6 +69,8 @@ pub struct CoordinatorConfig {
     pub plugins: BTreeSet<String>,
     /// Seed of the machine's one generator.
     pub seed: u64,
+    /// What earlier lives kept.
+    pub restored: Restored,
 }
 
 impl CoordinatorConfig {
@@ -79,6 +84,7 @@ impl CoordinatorConfig {
             max_crashes: 3,
             plugins: BTreeSet::new(),
             seed,
+            restored: Restored::default(),
         }
     }
 }
@@ -157,6 +163,8 @@ pub enum Effect {
         /// What is asked.
         question: Question,
     },
+    /// Keep something over this process's death: soon is enough, and several at once.
+    Keep(Keep),
 }
 
 /// How a node stands.
@@ -313,6 +321,8 @@ pub struct CoordinatorMachine {
     /// Jobs that lost their place during the current event.
     lost: BTreeMap<(AppId, BatchId), Vec<JobKey>>,
     recovery: Recovery,
+    /// What outlives this coordinator, beside its epoch.
+    durable: Durable,
     /// Who has large contents, and who brings them where.
     spreads: Spreads,
     /// Retract orders without an answer; at most one for each thief.
@@ -356,6 +366,7 @@ impl CoordinatorMachine {
             plugin_faults: BTreeMap::new(),
             lost: BTreeMap::new(),
             recovery: Recovery::default(),
+            durable: Durable::default(),
             spreads: Spreads::default(),
             steals: BTreeMap::new(),
             next_steal: 1,
@@ -376,6 +387,7 @@ impl CoordinatorMachine {
     /// Takes one event in.
     pub fn handle(&mut self, now: Instant, event: Event) {
         self.begin_recovery(now);
+        self.restore(now);
         let speaker = match event {
             Event::FromApp { link, message } => {
                 self.app_said(now, link, message);

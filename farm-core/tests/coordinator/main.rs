@@ -3,6 +3,7 @@
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on panics")]
 
 mod breaker;
+mod durable;
 mod farm;
 mod guard;
 mod hearing;

@@ -301,11 +301,11 @@ impl World {
     /// A farm that is about to start.
     #[must_use]
     pub fn new(setup: Setup) -> Self {
-        let store = Store { epoch: 1 };
+        let store = Store::new();
         let mut world = Self {
             now: Instant::ZERO,
             rng: SmallRng::seed_from_u64(setup.seed),
-            coordinator: store.coordinator(setup.seed, &setup),
+            coordinator: store.coordinator(Instant::ZERO, setup.seed, &setup),
             workers: Vec::new(),
             apps: Vec::new(),
             work: Work::default(),
