@@ -26,6 +26,9 @@ use crate::{
 /// for colder than it is.
 const MAX_KNOWN_CONTENTS: usize = 4_096;
 
+/// A job is overdue when it has taken this many times what it should. Tiles of one picture differ by less than that.
+const OVERDUE: f64 = 3.0;
+
 /// Who is at the other end of a connection.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Peer {
@@ -298,14 +301,16 @@ impl Device {
     }
 
     /// When it will be done with what it has, in nanoseconds from now: what is queued, less what of the first job must be
-    /// done already.
+    /// done already. A first job that takes far longer than it should is taken to need as long again as it is overdue: then
+    /// either the job or the device is not what it was taken for, and nothing else will tell before it ends.
     pub(super) fn free_at_ns(&self, now: Instant, modules: &Modules) -> f64 {
         if self.planned_jobs == 0 {
             return 0.0;
         }
         let queued_ns = self.throughput.queued_ns(modules);
         let elapsed_ns = now.since(self.busy_since).as_nanos() as f64;
-        queued_ns - elapsed_ns.min(queued_ns / self.planned_jobs as f64)
+        let first_ns = queued_ns / self.planned_jobs as f64;
+        queued_ns - elapsed_ns.min(first_ns) + (elapsed_ns - OVERDUE * first_ns).max(0.0)
     }
 
     pub(super) fn add_load(&mut self, now: Instant, load: Load) {
