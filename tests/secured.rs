@@ -14,7 +14,7 @@ use tests::{Process, farmctl};
 /// A secured coordinator, and where its people keep their identities.
 struct SecuredFarm {
     folder: tempfile::TempDir,
-    _coordinator: Process,
+    coordinator: Process,
     grpc: String,
 }
 
@@ -27,9 +27,9 @@ impl SecuredFarm {
         assert!(made.status.success(), "{made:?}");
         assert!(stdout(&made).contains("gleaner://studio/operator/operator"), "{made:?}");
         let flags = ["--listen", "127.0.0.1:0", "--http", "127.0.0.1:0", "--state", text(&state)];
-        let mut coordinator = Process::start("farm-coordinator", flags);
+        let mut coordinator = Process::start_on_small_disk("farm-coordinator", flags);
         let grpc = coordinator.next_json()["grpc"].as_str().unwrap().to_owned();
-        Self { folder, _coordinator: coordinator, grpc }
+        Self { folder, coordinator, grpc }
     }
 
     fn file(&self, name: &str) -> PathBuf {
@@ -164,4 +164,35 @@ fn an_identity_that_is_there_is_kept_when_another_takes_its_place() {
     let refused = farmctl(["--identity", text(&broken), "status"]);
     assert_eq!(refused.status.code(), Some(2), "{refused:?}");
     assert!(stderr(&refused).contains("broken.pem"), "{refused:?}");
+}
+
+/// 6 of `tests/README.md`: what was acknowledged stays, who works goes on, and when there is room again all is well without a
+/// restart. The limit is harder than a full disk: nothing that is there can be overwritten either.
+#[test]
+fn s06_a_full_disk_under_the_control_store_refuses_changes_and_nothing_else() {
+    let farm = SecuredFarm::start();
+    farm.join("node", "gpu-1");
+    let mut worker = farm.worker(&["--identity", text(&farm.file("gpu-1"))]);
+    assert_eq!(worker.next_json()["event"], "ready");
+    farm.coordinator.fill_disk(true);
+    for _ in 0..2 {
+        let refused = farm.as_who("operator", &["token", "create", "app"]);
+        assert_eq!(refused.status.code(), Some(1), "{refused:?}");
+        assert!(stderr(&refused).contains("File too large"), "it says why: {refused:?}");
+    }
+    farm.coordinator.fill_disk(false);
+    let tokens = stdout(&farm.as_who("operator", &["-o", "json", "token", "ls"]));
+    assert_eq!(tokens.trim(), "[]", "the one that was used is gone, the others never were");
+    farm.join("app", "artist");
+    let members = stdout(&farm.as_who("operator", &["member", "ls"]));
+    assert!(members.contains("node/gpu-1") && members.contains("app/artist"), "{members}");
+    let status = farm.as_who("artist", &["-o", "json", "status"]);
+    let status: serde_json::Value = serde_json::from_slice(&status.stdout).unwrap();
+    assert_eq!(status["nodes"][0]["name"], "gpu-1", "it was there all the time: {status}");
+    let (ended, words) = {
+        worker.signal(tests::Signal::Term);
+        worker.finish()
+    };
+    assert!(ended.success(), "{words}");
+    assert!(!words.contains("the coordinator is lost"), "its session stood:\n{words}");
 }

@@ -5,6 +5,7 @@
 
 mod audit;
 mod identities;
+mod keeper;
 mod owner;
 pub mod plugins;
 pub mod policy_host;
@@ -22,7 +23,7 @@ use std::{
 };
 
 use farm_core::{
-    coordinator::{CoordinatorConfig, CoordinatorMachine, FarmStatus},
+    coordinator::{CoordinatorConfig, CoordinatorMachine, FarmStatus, durable::Restored},
     id::NodeId,
     message::Liveness,
 };
@@ -35,6 +36,7 @@ use tokio::{
 
 pub use self::security::{AUTHORITY_FILE, initialise};
 use self::{
+    keeper::Keeper,
     owner::{Owner, OwnerHandle},
     plugins::{PluginOptions, Plugins},
     security::{Gate, Security, TrustService},
@@ -137,10 +139,10 @@ pub struct CoordinatorHandle {
     stop_owner: oneshot::Sender<()>,
     /// Dropped: the listeners take nothing new and end when their connections do.
     stop_servers: watch::Sender<()>,
-    /// Owner, gRPC server, HTTP server.
-    tasks: [JoinHandle<()>; 3],
+    /// Owner, what writes for it, gRPC server, HTTP server.
+    tasks: Vec<JoinHandle<()>>,
     /// Keeps the state directory locked.
-    _store: Option<Store>,
+    _store: Option<Arc<Store>>,
     /// Renews the coordinator's certificate; ends with the handle.
     renewal: JoinSet<()>,
 }
@@ -210,10 +212,11 @@ pub async fn start(options: CoordinatorOptions) -> Result<CoordinatorHandle, Sta
         None => Plugins::none(),
     };
     // After the addresses: a second coordinator on them is refused without counting as a life.
-    let mut store = options.state.as_deref().map(Store::open).transpose()?;
-    let epoch = store.as_ref().map_or_else(|| Ok(epoch_by_the_clock()), Store::begin_epoch)?;
+    let store = options.state.as_deref().map(Store::open).transpose()?.map(Arc::new);
+    let epoch = store.as_deref().map_or_else(|| Ok(epoch_by_the_clock()), Store::begin_epoch)?;
+    let restored = store.as_deref().map_or_else(|| Ok(Restored::default()), Store::restore)?;
     let gate = match (options.secured, &options.state) {
-        (false, _) if !options.insecure && store.as_ref().is_some_and(Store::has_members) => {
+        (false, _) if !options.insecure && store.as_deref().is_some_and(Store::has_members) => {
             return Err(StartError::Trust(format!(
                 "the state directory knows of members, but its {AUTHORITY_FILE} cannot be found: restore it, or secure the farm \
                  anew with `farmctl init`, or let everyone in with --insecure"
@@ -221,7 +224,7 @@ pub async fn start(options: CoordinatorOptions) -> Result<CoordinatorHandle, Sta
         }
         (false, _) => Gate::Open,
         (true, Some(directory)) => {
-            let store = store.take().ok_or_else(|| StartError::Trust("no control store".to_owned()))?;
+            let store = store.clone().ok_or_else(|| StartError::Trust("no control store".to_owned()))?;
             Gate::Members(Security::open(directory, store)?)
         }
         (true, None) => return Err(StartError::Trust("a secured farm needs a state directory".to_owned())),
@@ -230,6 +233,7 @@ pub async fn start(options: CoordinatorOptions) -> Result<CoordinatorHandle, Sta
         liveness: options.liveness,
         app_lease_ms: options.app_lease_ms,
         plugins: plugins.names(),
+        restored,
         ..CoordinatorConfig::new(epoch, random_seed())
     };
 
@@ -246,11 +250,18 @@ pub async fn start(options: CoordinatorOptions) -> Result<CoordinatorHandle, Sta
         renewal.spawn(Arc::clone(security).stay_valid());
     }
     let machine = CoordinatorMachine::new(config);
-    let owner_task = tokio::spawn(Owner::new(machine, plugins, gate.clone()).run(commands, owner_stops));
+    let mut tasks = Vec::new();
+    let keeper = store.as_ref().map_or_else(Keeper::none, |store| {
+        let (keeper, writes) = Keeper::new(Arc::downgrade(store));
+        tasks.push(tokio::spawn(writes));
+        keeper
+    });
+    let owner_task =
+        tokio::spawn(Owner::new(machine, plugins, keeper, gate.clone()).run(commands, owner_stops));
     let grpc_task = tokio::spawn(serve_grpc(incoming, owner.clone(), gate, servers_stop.clone()));
     let http_task = tokio::spawn(serve_http(http, owner.clone(), servers_stop));
     tracing::info!(%epoch, grpc = %grpc_addr, http = %http_addr, secured = options.secured, "coordinator started");
-    let tasks = [owner_task, grpc_task, http_task];
+    tasks.splice(0..0, [owner_task, grpc_task, http_task]);
     Ok(CoordinatorHandle {
         owner,
         grpc_addr,

@@ -22,6 +22,7 @@ use tonic::Status;
 
 use crate::{
     identities::Identities,
+    keeper::Keeper,
     plugins::{Answered, Plugins},
     security::Gate,
 };
@@ -93,6 +94,7 @@ impl<M> Peer<M> {
 pub(crate) struct Owner {
     machine: CoordinatorMachine,
     plugins: Plugins,
+    keeper: Keeper,
     /// The machine's time zero.
     origin: time::Instant,
     apps: HashMap<LinkId, Peer<CoordinatorToApp>>,
@@ -101,10 +103,11 @@ pub(crate) struct Owner {
 }
 
 impl Owner {
-    pub(crate) fn new(machine: CoordinatorMachine, plugins: Plugins, gate: Gate) -> Self {
+    pub(crate) fn new(machine: CoordinatorMachine, plugins: Plugins, keeper: Keeper, gate: Gate) -> Self {
         Self {
             machine,
             plugins,
+            keeper,
             origin: time::Instant::now(),
             apps: HashMap::new(),
             nodes: HashMap::new(),
@@ -223,6 +226,10 @@ impl Owner {
                     if let Err(reason) = self.plugins.ask(id, &plugin, question) {
                         self.machine.handle(now, Event::PolicyAnswered { question: id, answer: Err(reason) });
                     }
+                    continue;
+                }
+                Effect::Keep(change) => {
+                    self.keeper.keep(change);
                     continue;
                 }
                 Effect::Close { link } => {
@@ -351,7 +358,7 @@ mod tests {
         let (owner, commands) = OwnerHandle::new();
         let (_stop, stopped) = oneshot::channel();
         let machine = CoordinatorMachine::new(CoordinatorConfig::new(Epoch(1), 7));
-        tokio::spawn(Owner::new(machine, Plugins::none(), Gate::Open).run(commands, stopped));
+        tokio::spawn(Owner::new(machine, Plugins::none(), Keeper::none(), Gate::Open).run(commands, stopped));
         let open = |link, capacity| {
             let (outbound, outgoing) = mpsc::channel(capacity);
             let (alive, ended) = oneshot::channel();
@@ -403,7 +410,9 @@ mod tests {
         let (owner, commands) = OwnerHandle::new();
         let (stop, stopped) = oneshot::channel();
         let machine = CoordinatorMachine::new(CoordinatorConfig::new(Epoch(1), 7));
-        let task = tokio::spawn(Owner::new(machine, Plugins::none(), Gate::Open).run(commands, stopped));
+        let task = tokio::spawn(
+            Owner::new(machine, Plugins::none(), Keeper::none(), Gate::Open).run(commands, stopped),
+        );
         assert_eq!(owner.drain(NodeId(1)).await, Some(false), "no such node");
         drop(stop);
         task.await.unwrap();

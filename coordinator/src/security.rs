@@ -46,7 +46,7 @@ const MAX_TOKEN_USES: u32 = 100_000;
 pub(crate) struct Security {
     authority: Authority,
     identity: Identity,
-    store: Store,
+    store: Arc<Store>,
     audit: Audit,
 }
 
@@ -167,7 +167,7 @@ impl Gate {
 
 impl Security {
     /// Opens what `farmctl init` made.
-    pub(crate) fn open(directory: &Path, store: Store) -> Result<Arc<Self>, StartError> {
+    pub(crate) fn open(directory: &Path, store: Arc<Store>) -> Result<Arc<Self>, StartError> {
         let path = directory.join(AUTHORITY_FILE);
         let fault = |reason: String| StartError::State { path: path.clone(), reason };
         let authority = Authority::read(&path).map_err(|error| StartError::Trust(error.to_string()))?;

@@ -81,7 +81,13 @@ impl Profile {
     fn liveness(self) -> Liveness {
         match self {
             Self::Default => Liveness::default(),
-            Self::Lan => Liveness { heartbeat_ms: 200, suspect_ms: 600, dead_ms: 2_000, reconnect_ms: 1_000 },
+            Self::Lan => Liveness {
+                heartbeat_ms: 200,
+                suspect_ms: 600,
+                dead_ms: 2_000,
+                reconnect_ms: 1_000,
+                ..Liveness::default()
+            },
         }
     }
 }
@@ -111,6 +117,7 @@ struct LivenessTable {
     suspect_ms: Option<u64>,
     dead_ms: Option<u64>,
     reconnect_ms: Option<u64>,
+    compare_ms: Option<u64>,
 }
 
 /// Checked options from everything the user said. Every error is a usage error and names flag, file or key.
@@ -176,6 +183,7 @@ fn liveness(flag: Option<Profile>, table: &LivenessTable) -> anyhow::Result<Live
             suspect_ms: table.suspect_ms.unwrap_or(base.suspect_ms),
             dead_ms: table.dead_ms.unwrap_or(base.dead_ms),
             reconnect_ms: table.reconnect_ms.unwrap_or(base.reconnect_ms),
+            compare_ms: table.compare_ms.unwrap_or(base.compare_ms),
         };
         let Liveness { heartbeat_ms, suspect_ms, dead_ms, .. } = liveness;
         if heartbeat_ms == 0 || heartbeat_ms >= suspect_ms || suspect_ms >= dead_ms {

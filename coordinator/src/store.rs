@@ -1,7 +1,9 @@
 //! What the coordinator keeps over its own death: its epoch, and, in a secured farm, who is a member and who may become one.
-//! Plans, load and fairness are rebuilt from re-registration and never stored.
+//! Plans, load and fairness are rebuilt from re-registration and never stored; what crashes and devices taught is (`soft`).
 //!
 //! A redb database: what a method has returned is on disk, and after a crash the store is what was committed last.
+
+mod soft;
 
 use std::{
     any::Any,
@@ -22,6 +24,7 @@ use redb::{
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
+use self::soft::{SPEEDS, STOPPED};
 use crate::StartError;
 
 /// The database in the state directory.
@@ -193,6 +196,8 @@ impl Store {
             let mut numbers = transaction.open_table(NUMBERS).map_err(broken)?;
             transaction.open_table(TOKENS).map_err(broken)?;
             transaction.open_table(MEMBERS).map_err(broken)?;
+            transaction.open_table(STOPPED).map_err(broken)?;
+            transaction.open_table(SPEEDS).map_err(broken)?;
             let known = numbers.get(EPOCH).map_err(broken)?.is_some();
             if let Some(earlier) = earlier.filter(|_| !known) {
                 numbers.insert(EPOCH, u64::from(earlier)).map_err(broken)?;
@@ -207,6 +212,7 @@ impl Store {
         let read = || {
             self.tokens(0)?;
             self.members()?;
+            self.restored()?;
             self.read(|transaction| {
                 let numbers = transaction.open_table(NUMBERS).map_err(broken)?;
                 numbers.get(EPOCH).map_err(broken)?;
@@ -432,6 +438,18 @@ fn everything(database: &Database) -> Result<Vec<Entry>, redb::Error> {
     }
     if let Some(members) = absent(transaction.open_table(MEMBERS))? {
         for entry in members.iter()? {
+            let (key, value) = entry?;
+            entries.push((key.value().into(), value.value().into()));
+        }
+    }
+    if let Some(stopped) = absent(transaction.open_table(STOPPED))? {
+        for entry in stopped.iter()? {
+            let (key, value) = entry?;
+            entries.push((key.value().to_le_bytes().into(), value.value().into()));
+        }
+    }
+    if let Some(speeds) = absent(transaction.open_table(SPEEDS))? {
+        for entry in speeds.iter()? {
             let (key, value) = entry?;
             entries.push((key.value().into(), value.value().into()));
         }

@@ -11,11 +11,13 @@ use coordinator::{CoordinatorHandle, CoordinatorOptions, StartError, start};
 use farm_core::{
     coordinator::NodeState,
     device::{DeviceInfo, DeviceKind, Features, Limits, Requirements},
-    id::{BatchId, Epoch, JobIndex, NodeId, NodeSession, TaskId},
+    id::{BatchId, DeviceIndex, Epoch, JobIndex, NodeId, NodeSession, TaskId},
     message::{
         AppHello, AppToCoordinator, CacheFigures, Contact, CoordinatorToApp, CoordinatorToNode, CostNs,
-        NodeHello, NodeToCoordinator, PROTOCOL_VERSION, PlanJob, PlanRequest, WaitReason,
+        Executed, JobFailure, JobTrace, NodeHello, NodeToCoordinator, PROTOCOL_VERSION, PlanJob, PlanRequest,
+        WaitReason,
     },
+    time::Instant,
 };
 use proto::control::{self, Session, SessionError, v1};
 use tokio_stream::StreamExt as _;
@@ -31,16 +33,19 @@ async fn farm() -> (CoordinatorHandle, String) {
 
 async fn app(address: &str, protocol: u32) -> AppSession {
     let session = control::connect_app(address, None, &[]).await.unwrap();
-    let hello = AppHello {
+    session.sender.try_send(AppToCoordinator::Hello(app_hello(protocol))).unwrap();
+    session
+}
+
+fn app_hello(protocol: u32) -> AppHello {
+    AppHello {
         protocol,
         name: "an app".to_owned(),
         weight: 1.0,
         global_stealing: false,
         policy: String::new(),
         resume: None,
-    };
-    session.sender.try_send(AppToCoordinator::Hello(hello)).unwrap();
-    session
+    }
 }
 
 async fn node(address: &str) -> NodeSessionLink {
@@ -223,6 +228,66 @@ async fn each_life_has_a_larger_epoch() {
         assert_eq!(handle.status().await.unwrap().epoch, Epoch(expected));
         handle.shutdown().await;
     }
+}
+
+/// Reads until the application hears why it is stopped.
+async fn stopped(app: &mut AppSession) -> String {
+    loop {
+        match app.receiver.recv().await.unwrap() {
+            CoordinatorToApp::Stopped { reason } => return reason,
+            other => assert!(!matches!(other, CoordinatorToApp::Refused { .. }), "got {other:?}"),
+        }
+    }
+}
+
+#[tokio::test]
+async fn an_application_that_was_stopped_is_so_after_a_restart() {
+    let state = tempfile::tempdir().unwrap();
+    let options =
+        CoordinatorOptions { state: Some(state.path().to_owned()), ..CoordinatorOptions::embedded() };
+    let handle = start(options.clone()).await.unwrap();
+    let address = handle.grpc_addr().to_string();
+    let node = node(&address).await;
+    let mut first = app(&address, PROTOCOL_VERSION).await;
+    let welcome = first.receiver.recv().await.unwrap();
+    let CoordinatorToApp::Welcome { app: id, incarnation, .. } = welcome else { panic!("got {welcome:?}") };
+    first.sender.try_send(plan_request(8)).unwrap();
+    let jobs = loop {
+        if let CoordinatorToApp::Plan(plan) = first.receiver.recv().await.unwrap() {
+            break plan.nodes[0].devices[0].jobs.clone();
+        }
+    };
+    let crashed = |job| Executed {
+        job,
+        device: DeviceIndex(0),
+        device_time_ns: 0,
+        trace: JobTrace::default(),
+        failure: Some(JobFailure::Timeout),
+    };
+    let executed = jobs.into_iter().map(crashed).collect();
+    let report = NodeToCoordinator::Report { sent_at: Instant::ZERO, executed, delivered: Vec::new() };
+    node.sender.send(report).await.unwrap();
+    let reason = stopped(&mut first).await;
+    assert!(reason.starts_with("8 attempts in a row"), "got {reason}");
+    handle.shutdown().await;
+
+    let handle = start(options).await.unwrap();
+    let address = handle.grpc_addr().to_string();
+    let hello = AppHello { resume: Some((id, incarnation)), ..app_hello(PROTOCOL_VERSION) };
+    let mut again = control::connect_app(&address, None, &[]).await.unwrap();
+    again.sender.try_send(AppToCoordinator::Hello(hello)).unwrap();
+    again.sender.try_send(plan_request(1)).unwrap();
+    assert_eq!(stopped(&mut again).await, reason);
+    let mut other = app(&address, PROTOCOL_VERSION).await;
+    other.sender.try_send(plan_request(1)).unwrap();
+    loop {
+        match other.receiver.recv().await.unwrap() {
+            CoordinatorToApp::Welcome { .. } => {}
+            CoordinatorToApp::Waiting { .. } => break,
+            other => panic!("another application is not stopped: {other:?}"),
+        }
+    }
+    handle.shutdown().await;
 }
 
 #[tokio::test]

@@ -7,6 +7,7 @@
 
 pub mod coordinator;
 pub mod device;
+pub mod holding;
 pub mod id;
 pub mod ledger;
 pub mod message;

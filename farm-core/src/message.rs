@@ -1,10 +1,13 @@
 //! What the tiers say to each other, as domain data. Wire formats are `proto`'s; payload bytes (programs, results,
 //! allocations) never enter a machine: messages carry their names and sizes only.
 
+use std::time::Duration;
+
 use serde::{Deserialize, Serialize};
 
 use crate::{
     device::{DeviceInfo, Requirements},
+    holding::Holding,
     id::{
         AppId, AppIncarnation, Attempt, BatchId, ContentHash, DeviceIndex, Epoch, JobAttempt, JobId,
         JobIndex, NodeId, NodeSession, StealId, TaskId,
@@ -14,7 +17,7 @@ use crate::{
 };
 
 /// The protocol this build speaks. A peer of another version is refused at hello.
-pub const PROTOCOL_VERSION: u32 = 4;
+pub const PROTOCOL_VERSION: u32 = 5;
 
 /// Estimated work of a job: nanoseconds on a device of speed 1.0. Zero means unknown.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
@@ -45,12 +48,29 @@ pub struct Liveness {
     pub dead_ms: u64,
     /// After a closed connection, how long the peer may take to come back before it counts as dead.
     pub reconnect_ms: u64,
+    /// Two ends compare what one holds of the other's jobs this often.
+    pub compare_ms: u64,
+}
+
+impl Liveness {
+    /// Time between two comparisons; no shorter than between heartbeats.
+    #[must_use]
+    pub const fn compare_every(&self) -> Duration {
+        let least_ms = if self.heartbeat_ms > 1 { self.heartbeat_ms } else { 1 };
+        Duration::from_millis(if self.compare_ms > least_ms { self.compare_ms } else { least_ms })
+    }
 }
 
 impl Default for Liveness {
     fn default() -> Self {
         // 20-delivery.md, failure table: heartbeat 1 s, suspect 3 s, dead 10 s; a closed connection is suspect at once.
-        Self { heartbeat_ms: 1_000, suspect_ms: 3_000, dead_ms: 10_000, reconnect_ms: 2_000 }
+        Self {
+            heartbeat_ms: 1_000,
+            suspect_ms: 3_000,
+            dead_ms: 10_000,
+            reconnect_ms: 2_000,
+            compare_ms: 30_000,
+        }
     }
 }
 
@@ -438,6 +458,11 @@ pub enum NodeToCoordinator {
     },
     /// A drained node leaves: it holds no job any more.
     Goodbye,
+    /// Every attempt held, executed but undelivered ones too; every [`Liveness::compare_ms`]. Where the coordinator would have it otherwise it
+    /// answers with [`CoordinatorToNode::SayInventory`].
+    Holding(Holding),
+    /// Answer to [`CoordinatorToNode::SayInventory`]: those attempts.
+    Inventory(Vec<JobAttempt>),
 }
 
 /// Coordinator to node.
@@ -488,6 +513,8 @@ pub enum CoordinatorToNode {
         /// A node that has it; `None`: from the application.
         peer: Option<Contact>,
     },
+    /// Say what is held: answer with [`NodeToCoordinator::Inventory`].
+    SayInventory,
     /// Drop these contents, in memory and on disk, where no job needs them; all such if none is named.
     Evict {
         /// Which.
@@ -548,6 +575,9 @@ pub enum AppToNode {
     Acks(Vec<ResultAck>),
     /// Forget these attempts.
     Cancel(Vec<JobAttempt>),
+    /// Attempts of the application that should be there, and its results that it has not acknowledged; every
+    /// [`Liveness::compare_ms`]. A node that holds others answers with [`NodeToApp::Inventory`].
+    Holding(Holding),
 }
 
 /// What became of an attempt, as its application sees it.
@@ -582,4 +612,6 @@ pub enum NodeToApp {
     },
     /// An attempt ended. The frame's payload is the sections, one after the other.
     Result(ResultHeader),
+    /// Every attempt of the application that is held, executed but unacknowledged ones too.
+    Inventory(Vec<JobAttempt>),
 }

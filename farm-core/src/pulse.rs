@@ -32,6 +32,11 @@ impl Pulse {
         Self { liveness, next, answer_by, answers: Answers::Come }
     }
 
+    /// The timings of the session.
+    pub(crate) const fn liveness(&self) -> &Liveness {
+        &self.liveness
+    }
+
     /// When [`Self::beat`] has something to say.
     pub(crate) fn due(&self) -> Instant {
         match self.answers {

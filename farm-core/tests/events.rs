@@ -51,6 +51,10 @@ fn attempt(app: u8, index: u8, sequence: u8) -> JobAttempt {
     }
 }
 
+fn inventory(step: Step) -> Vec<JobAttempt> {
+    (0..step.four).map(|sequence| attempt(1, sequence, sequence * 2)).collect()
+}
+
 fn content(tag: u8) -> Content {
     Content { hash: ContentHash([tag; 32]), size_bytes: if tag.is_multiple_of(2) { 4 } else { 4 << 20 } }
 }
@@ -142,7 +146,7 @@ fn coordinator_event(step: Step) -> coordinator::Event {
             session: NodeSession(u64::from(step.three / 2)),
             devices: (0..=step.two).map(device).collect(),
             contact: contact(),
-            inventory: (0..step.four).map(|sequence| attempt(1, sequence, sequence * 2)).collect(),
+            inventory: inventory(step),
         })),
         5 => from_node(NodeToCoordinator::Heartbeat {
             sequence: 1,
@@ -166,6 +170,8 @@ fn coordinator_event(step: Step) -> coordinator::Event {
                 .map(|sequence| attempt(step.two, sequence, sequence * (step.four + 1)))
                 .collect(),
         }),
+        11 if step.four == 0 => from_node(NodeToCoordinator::Holding(inventory(step).into_iter().collect())),
+        11 if step.four < 4 => from_node(NodeToCoordinator::Inventory(inventory(step))),
         11 => from_node(NodeToCoordinator::DeviceLost {
             device: DeviceIndex(step.two.into()),
             reason: "test".to_owned(),
@@ -247,6 +253,7 @@ fn worker_event(step: Step) -> worker::Event {
             job: attempt(step.one % 2, step.three, step.four),
             digest: ContentHash([u8::from(step.two == 0); 32]),
         }])),
+        10 if step.two == 0 => from_app(AppToNode::Holding(inventory(step).into_iter().collect())),
         10 => from_app(AppToNode::Cancel(vec![attempt(step.one % 2, step.three, step.four)])),
         11 => worker::Event::AppLinkClosed { link },
         12 | 13 => worker::Event::ContentReady(ContentHash([step.two; 32])),
@@ -386,6 +393,7 @@ fn ledger_event(step: Step) -> ledger::Event {
         12 => ledger::Event::NodeLost { node, session },
         13 | 14 => from_node(NodeToApp::Welcome { node, session }),
         15 if step.four == 0 => from_node(NodeToApp::Refused { reason: "test".to_owned() }),
+        15 => from_node(NodeToApp::Inventory(inventory(step))),
         16..=19 => from_node(NodeToApp::Result(ResultHeader {
             job: JobAttempt {
                 job: JobId {

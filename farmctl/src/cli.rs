@@ -447,6 +447,9 @@ pub(crate) struct BenchArgs {
     /// Most iterations of `mi` on them.
     #[arg(long, default_value_t = 512, value_parser = clap::value_parser!(u64).range(8..=100_000))]
     pub iterations: u64,
+    /// Points of its curve over iterations: all of them, then half, a quarter and an eighth.
+    #[arg(long, default_value_t = 4, value_parser = clap::value_parser!(u8).range(1..=4))]
+    pub points: u8,
     /// Where `steal` leaves pictures of its last runs (SVG): figures 5.11 and 5.12 of the thesis.
     #[arg(long, value_name = "FOLDER")]
     pub pictures: Option<PathBuf>,

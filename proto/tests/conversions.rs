@@ -98,11 +98,12 @@ fn contact() -> impl Strategy<Value = Contact> {
 }
 
 fn liveness() -> impl Strategy<Value = Liveness> {
-    any::<[u64; 4]>().prop_map(|ms| Liveness {
+    any::<[u64; 5]>().prop_map(|ms| Liveness {
         heartbeat_ms: ms[0],
         suspect_ms: ms[1],
         dead_ms: ms[2],
         reconnect_ms: ms[3],
+        compare_ms: ms[4],
     })
 }
 
@@ -282,6 +283,8 @@ fn node_to_coordinator() -> impl Strategy<Value = NodeToCoordinator> {
             }
         ),
         Just(NodeToCoordinator::Goodbye),
+        attempts().prop_map(|held| NodeToCoordinator::Holding(held.into_iter().collect())),
+        attempts().prop_map(NodeToCoordinator::Inventory),
     ]
 }
 
@@ -316,6 +319,7 @@ fn coordinator_to_node() -> impl Strategy<Value = CoordinatorToNode> {
             liveness
         }),
         "\\PC{0,80}".prop_map(|reason| CoordinatorToNode::Refused { reason }),
+        Just(CoordinatorToNode::SayInventory),
         (any::<u64>(), positive())
             .prop_map(|(app, weight)| CoordinatorToNode::AppJoined { app: AppId(app), weight }),
         any::<u64>().prop_map(|app| CoordinatorToNode::AppLeft { app: AppId(app) }),

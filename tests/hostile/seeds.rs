@@ -119,6 +119,12 @@ pub(crate) const SEEDS: &[Seed] = &[
         );
         node_to_coordinator(NodeToCoordinator::CacheChanged { held, gone })
     }),
+    ("node_to_coordinator", "valid-holding", || {
+        node_to_coordinator(NodeToCoordinator::Holding(attempts(3).into_iter().collect()))
+    }),
+    ("node_to_coordinator", "valid-inventory", || {
+        node_to_coordinator(NodeToCoordinator::Inventory(attempts(3)))
+    }),
     ("coordinator_to_node", "valid-retract", || {
         coordinator_to_node(CoordinatorToNode::Retract { steal: StealId(5), jobs: attempts(6) })
     }),
@@ -298,6 +304,7 @@ fn frames_to_node() -> Vec<u8> {
         link::encode_frame(&jobs, &codec::pack_programs([&encoded, &encoded])).unwrap(),
         link::encode_frame(&acks, &[]).unwrap(),
         link::encode_frame(&AppToNode::Cancel(attempts(3)), &[]).unwrap(),
+        link::encode_frame(&AppToNode::Holding(attempts(3).into_iter().collect()), &[]).unwrap(),
     ];
     frames.concat()
 }
@@ -316,6 +323,7 @@ fn frames_to_app() -> Vec<u8> {
         link::encode_frame(&result(Ok(vec![4, 8])), &[vec![1; 12].into()]).unwrap(),
         link::encode_frame(&result(Err(JobFailure::Poison("twice".to_owned()))), &[]).unwrap(),
         link::encode_frame(&NodeToApp::Refused { reason: "no".to_owned() }, &[]).unwrap(),
+        link::encode_frame(&NodeToApp::Inventory(attempts(3)), &[]).unwrap(),
     ];
     frames.concat()
 }

@@ -4,8 +4,8 @@
 usage: mi_speed.py ONE_CORE ALIGNMENT.fasta...
 
 ONE_CORE is the built example of that name (`cargo build --release -p mi-kernel --example one_core`); `farmctl alignment
-thesis-a FILE` writes the thesis' sets. Prints CPU seconds of ProDy's `buildMutinfoMatrix(ambiguity=False, turbo=True)`, and of the
-loop with its shuffle and without reading. Needs prody from PyPI.
+thesis-a FILE` writes the thesis' sets. Prints CPU seconds of ProDy's `buildMutinfoMatrix(ambiguity=False, turbo=True)`, and of
+the loop with its shuffle and without reading. Needs prody from PyPI.
 """
 import re
 import subprocess

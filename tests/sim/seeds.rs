@@ -67,6 +67,11 @@ fn elastic_farms_execute_nothing_twice() {
 }
 
 #[test]
+fn losses() {
+    sweep("losses", 0..250);
+}
+
+#[test]
 fn fair_shares() {
     let checks = sweep("fair", 0..8);
     assert!(checks.lags > 1_000, "lags were looked at");

@@ -44,7 +44,10 @@ pub fn binary(name: &str) -> PathBuf {
 
 /// A workspace binary that does not know the farms of whoever runs the tests.
 fn command(name: &str) -> Command {
-    let mut command = Command::new(binary(name));
+    isolated(Command::new(binary(name)))
+}
+
+fn isolated(mut command: Command) -> Command {
     command
         .env_remove("GLEANER_COORDINATOR")
         .env_remove("GLEANER_IDENTITY")
@@ -78,7 +81,28 @@ impl Process {
     /// # Panics
     /// It cannot be started.
     pub fn start<S: AsRef<OsStr>>(name: &str, arguments: impl IntoIterator<Item = S>) -> Self {
-        Self::start_with(name, arguments, Stdio::piped())
+        Self::start_with(command(name).args(arguments), name, Stdio::piped())
+    }
+
+    /// Starts a workspace binary that [`Self::fill_disk`] does not kill.
+    ///
+    /// # Panics
+    /// It cannot be started.
+    pub fn start_on_small_disk<S: AsRef<OsStr>>(name: &str, arguments: impl IntoIterator<Item = S>) -> Self {
+        // The system sends this signal with the error where a limit is reached.
+        let shell = ["-c", "trap '' XFSZ; exec \"$0\" \"$@\""];
+        let mut command = isolated(Command::new("sh"));
+        Self::start_with(command.args(shell).arg(binary(name)).args(arguments), name, Stdio::piped())
+    }
+
+    /// From now on the disk takes nothing more of it, or everything again.
+    ///
+    /// # Panics
+    /// The limit cannot be set.
+    pub fn fill_disk(&self, full: bool) {
+        let limit = if full { "--fsize=0:" } else { "--fsize=unlimited:" };
+        let set = Command::new("prlimit").args(["--pid", &self.child.id().to_string(), limit]).status();
+        assert!(set.expect("util-linux is there").success(), "{limit} of {} cannot be set", self.name);
     }
 
     /// Starts a workspace binary whose stderr cannot be written, as on a full disk.
@@ -87,16 +111,11 @@ impl Process {
     /// It cannot be started.
     pub fn start_muted<S: AsRef<OsStr>>(name: &str, arguments: impl IntoIterator<Item = S>) -> Self {
         let full = OpenOptions::new().write(true).open("/dev/full").expect("Linux has /dev/full");
-        Self::start_with(name, arguments, full.into())
+        Self::start_with(command(name).args(arguments), name, full.into())
     }
 
-    fn start_with<S: AsRef<OsStr>>(
-        name: &str,
-        arguments: impl IntoIterator<Item = S>,
-        stderr: Stdio,
-    ) -> Self {
-        let mut child = command(name)
-            .args(arguments)
+    fn start_with(command: &mut Command, name: &str, stderr: Stdio) -> Self {
+        let mut child = command
             .stdin(Stdio::null())
             .stdout(Stdio::piped())
             .stderr(stderr)

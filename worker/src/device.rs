@@ -32,7 +32,7 @@ pub(crate) enum DeviceNews {
 }
 
 /// A result's bytes with what its header says of them.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 pub(crate) struct Payload {
     pub(crate) sections: Vec<Bytes>,
     pub(crate) digest: ContentHash,
@@ -63,6 +63,11 @@ impl Payload {
         }
         Self { digest: ContentHash(*hasher.finalize().as_bytes()), sections }
     }
+}
+
+/// Bytes of a result.
+pub(crate) fn size_of(sections: &[Bytes]) -> u64 {
+    sections.iter().map(|section| section.len() as u64).sum()
 }
 
 /// A device's executor, and orders that wait while it winds an aborted job up.

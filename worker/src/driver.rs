@@ -30,7 +30,7 @@ use tokio::{
 use crate::{
     End, WorkerOptions,
     contents::{Contents, Fetched},
-    device::{Device, DeviceEvent, DeviceNews, Payload},
+    device::{Device, DeviceEvent, DeviceNews},
     executor::{Executor, Order},
     link::{self, Outbox, Source},
     programs::Programs,
@@ -287,6 +287,7 @@ impl Driver {
             | CoordinatorToNode::Located { .. }
             | CoordinatorToNode::Evict { .. }
             | CoordinatorToNode::Drain
+            | CoordinatorToNode::SayInventory
             | CoordinatorToNode::HeartbeatAck { .. } => {}
         }
         self.tell(Event::FromCoordinator(message));
@@ -367,19 +368,18 @@ impl Driver {
                 if let Some(device) = self.devices.get_mut(usize::from(device.0)) {
                     device.finished();
                 }
-                let (outcome, sections) = match outcome {
-                    Ok(Payload { sections, digest }) => {
-                        let lengths = sections.iter().map(|section| section.len() as u64).collect();
-                        (Ok((lengths, digest)), sections)
+                let (outcome, payload) = match outcome {
+                    Ok(payload) => {
+                        let lengths = payload.sections.iter().map(|section| section.len() as u64).collect();
+                        (Ok((lengths, payload.digest)), Some(payload))
                     }
-                    Err(failure) => (Err(failure), Vec::new()),
+                    Err(failure) => (Err(failure), None),
                 };
-                let completed = outcome.is_ok();
                 self.tell(Event::Executed { job, device, device_time_ns, outcome });
                 // Not if it was taken back meanwhile, and runs on another device or not at all: the bytes belong to the header.
-                if completed && self.machine.executed_on(job) == Some(device) {
+                if let Some(payload) = payload.filter(|_| self.machine.executed_on(job) == Some(device)) {
                     self.programs.discard(job);
-                    self.spool.keep(job, sections);
+                    self.spool.keep(job, payload);
                 }
             }
             DeviceNews::Lost(reason) => {
@@ -455,7 +455,7 @@ impl Driver {
     }
 
     fn fetch(&mut self, content: Content, from: Provider) {
-        if self.contents.pin(content.hash) {
+        if self.contents.pin(content) {
             self.found.push(Event::ContentReady(content.hash));
             return;
         }

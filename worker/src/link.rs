@@ -182,7 +182,8 @@ fn result_of(header: &NodeToApp) -> Option<JobAttempt> {
         NodeToApp::Result(ResultHeader { job, outcome: Ok(_), .. }) => Some(*job),
         NodeToApp::Result(ResultHeader { outcome: Err(_), .. })
         | NodeToApp::Welcome { .. }
-        | NodeToApp::Refused { .. } => None,
+        | NodeToApp::Refused { .. }
+        | NodeToApp::Inventory(_) => None,
     }
 }
 

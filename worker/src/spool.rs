@@ -17,10 +17,14 @@ use std::{
 };
 
 use bytes::Bytes;
-use farm_core::id::JobAttempt;
+use farm_core::id::{ContentHash, JobAttempt};
+use proto::codec::content_hash;
 use tokio::sync::mpsc;
 
-use crate::driver::Input;
+use crate::{
+    device::{Payload, size_of},
+    driver::Input,
+};
 
 /// Results are written to one file until it holds this many bytes.
 const FILE_BYTES: u64 = 64 << 20;
@@ -70,8 +74,8 @@ struct State {
 
 #[derive(Debug)]
 enum Held {
-    Memory { serial: u64, sections: Vec<Bytes> },
-    Disk { file: Arc<SpoolFile>, offset: u64, lengths: Vec<usize>, digest: blake3::Hash },
+    Memory { serial: u64, payload: Payload },
+    Disk { file: Arc<SpoolFile>, offset: u64, lengths: Vec<usize>, digest: ContentHash },
 }
 
 /// A file without a name.
@@ -94,21 +98,21 @@ impl Spool {
     }
 
     /// Keeps a result.
-    pub(crate) fn keep(&self, job: JobAttempt, sections: Vec<Bytes>) {
+    pub(crate) fn keep(&self, job: JobAttempt, payload: Payload) {
         let mut state = self.state();
         state.forget(job);
         let serial = state.next_serial;
         state.next_serial += 1;
-        state.memory_bytes += size_of(&sections);
+        state.memory_bytes += size_of(&payload.sections);
         state.in_memory.insert(serial, job);
-        state.results.insert(job, Held::Memory { serial, sections });
+        state.results.insert(job, Held::Memory { serial, payload });
         self.spill_if_needed(&mut state);
     }
 
     /// A result, if it is in memory.
     pub(crate) fn at_hand(&self, job: JobAttempt) -> Option<Vec<Bytes>> {
         match self.state().results.get(&job) {
-            Some(Held::Memory { sections, .. }) => Some(sections.clone()),
+            Some(Held::Memory { payload, .. }) => Some(payload.sections.clone()),
             Some(Held::Disk { .. }) | None => None,
         }
     }
@@ -120,7 +124,7 @@ impl Spool {
     pub(crate) async fn read(&self, job: JobAttempt) -> io::Result<Option<Vec<Bytes>>> {
         let (file, offset, lengths, digest) = match self.state().results.get(&job) {
             None => return Ok(None),
-            Some(Held::Memory { sections, .. }) => return Ok(Some(sections.clone())),
+            Some(Held::Memory { payload, .. }) => return Ok(Some(payload.sections.clone())),
             Some(Held::Disk { file, offset, lengths, digest }) => {
                 (Arc::clone(file), *offset, lengths.clone(), *digest)
             }
@@ -128,7 +132,7 @@ impl Spool {
         let reading = tokio::task::spawn_blocking(move || {
             let mut bytes = vec![0; lengths.iter().sum()];
             file.file.read_exact_at(&mut bytes, offset)?;
-            if blake3::hash(&bytes) != digest {
+            if content_hash(&bytes) != digest {
                 return Err(io::Error::new(io::ErrorKind::InvalidData, "the disk gave other bytes back"));
             }
             let mut rest = Bytes::from(bytes);
@@ -179,7 +183,7 @@ impl Spool {
             let written = self.write(&oldest);
             let mut state = self.state();
             match written {
-                Ok((file, digests)) => state.spilled(oldest, &digests, &Arc::new(file)),
+                Ok(file) => state.spilled(oldest, &Arc::new(file)),
                 Err(error) => {
                     tracing::warn!(%error, "results cannot be kept on disk; they stay in memory, and no more are made than it holds");
                     state.disk_failed = Some(Instant::now());
@@ -192,7 +196,7 @@ impl Spool {
     }
 
     /// A file full of the oldest results in memory; none if there is room, or the disk takes none.
-    fn next_to_spill(&self) -> Option<Vec<(JobAttempt, Vec<Bytes>)>> {
+    fn next_to_spill(&self) -> Option<Vec<(JobAttempt, Payload)>> {
         let mut state = self.state();
         if !self.disk_takes(&state) {
             state.spilling = false;
@@ -207,58 +211,47 @@ impl Spool {
         let mut file_bytes = 0;
         let mut oldest = Vec::new();
         for job in state.in_memory.values() {
-            let Some(Held::Memory { sections, .. }) = state.results.get(job) else { continue };
-            let size_bytes = size_of(sections);
+            let Some(Held::Memory { payload, .. }) = state.results.get(job) else { continue };
+            let size_bytes = size_of(&payload.sections);
             // One goes whatever its size.
             if excess == 0 || (file_bytes > 0 && file_bytes + size_bytes > most) {
                 break;
             }
             excess = excess.saturating_sub(size_bytes);
             file_bytes += size_bytes;
-            oldest.push((*job, sections.clone()));
+            oldest.push((*job, payload.clone()));
         }
         state.spilling = !oldest.is_empty();
         state.spilling.then_some(oldest)
     }
 
-    /// The results in one file, with the digest of each.
-    fn write(&self, results: &[(JobAttempt, Vec<Bytes>)]) -> io::Result<(SpoolFile, Vec<blake3::Hash>)> {
+    /// The results in one file.
+    fn write(&self, results: &[(JobAttempt, Payload)]) -> io::Result<SpoolFile> {
         let (folder, _) = self.room.disk.as_ref().ok_or_else(|| io::Error::other("there is no folder"))?;
         let mut file = tempfile::tempfile_in(folder)?;
         let mut bytes = 0;
-        let mut digests = Vec::with_capacity(results.len());
-        for (_, sections) in results {
-            let mut digest = blake3::Hasher::new();
-            for section in sections {
-                file.write_all(section)?;
-                digest.update(section);
-            }
+        for (_, Payload { sections, .. }) in results {
+            sections.iter().try_for_each(|section| file.write_all(section))?;
             bytes += size_of(sections);
-            digests.push(digest.finalize());
         }
         let disk_bytes = Arc::clone(&self.state().disk_bytes);
         disk_bytes.fetch_add(bytes, Ordering::Relaxed);
-        Ok((SpoolFile { file, bytes, disk_bytes }, digests))
+        Ok(SpoolFile { file, bytes, disk_bytes })
     }
 }
 
 impl State {
     fn forget(&mut self, job: JobAttempt) {
-        if let Some(Held::Memory { serial, sections }) = self.results.remove(&job) {
+        if let Some(Held::Memory { serial, payload }) = self.results.remove(&job) {
             self.in_memory.remove(&serial);
-            self.memory_bytes -= size_of(&sections);
+            self.memory_bytes -= size_of(&payload.sections);
         }
     }
 
     /// These are on disk now; those that were acknowledged meanwhile need no place.
-    fn spilled(
-        &mut self,
-        results: Vec<(JobAttempt, Vec<Bytes>)>,
-        digests: &[blake3::Hash],
-        file: &Arc<SpoolFile>,
-    ) {
+    fn spilled(&mut self, results: Vec<(JobAttempt, Payload)>, file: &Arc<SpoolFile>) {
         let mut offset = 0;
-        for ((job, sections), &digest) in results.into_iter().zip(digests) {
+        for (job, Payload { sections, digest }) in results {
             let size_bytes = size_of(&sections);
             if self.results.contains_key(&job) {
                 self.forget(job);
@@ -268,10 +261,6 @@ impl State {
             offset += size_bytes;
         }
     }
-}
-
-fn size_of(sections: &[Bytes]) -> u64 {
-    sections.iter().map(|section| section.len() as u64).sum()
 }
 
 #[cfg(test)]
@@ -307,7 +296,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let (spool, mut received) = spool(100, Some((folder.path(), 1_000)));
         for index in 0..3 {
-            spool.keep(job(index), result(index));
+            spool.keep(job(index), Payload::of(result(index)));
         }
         spilled(&mut received).await;
         assert_eq!(spool.at_hand(job(0)), None, "the oldest is on disk");
@@ -330,7 +319,7 @@ mod tests {
     async fn other_bytes_from_the_disk_are_an_error() {
         let folder = tempfile::tempdir().unwrap();
         let (spool, mut received) = spool(0, Some((folder.path(), 1_000)));
-        spool.keep(job(0), result(0));
+        spool.keep(job(0), Payload::of(result(0)));
         spilled(&mut received).await;
         match spool.state().results.get(&job(0)) {
             Some(Held::Disk { file, .. }) => file.file.write_all_at(b"x", 5).unwrap(),
@@ -343,7 +332,7 @@ mod tests {
     async fn small_results_share_a_file() {
         let folder = tempfile::tempdir().unwrap();
         let (spool, mut received) = spool(400, Some((folder.path(), 10_000)));
-        (0..11).for_each(|index| spool.keep(job(index), result(index)));
+        (0..11).for_each(|index| spool.keep(job(index), Payload::of(result(index))));
         spilled(&mut received).await;
         let state = spool.state();
         let on_disk = state.results.values().filter(|held| matches!(held, Held::Disk { .. })).count();
@@ -353,12 +342,12 @@ mod tests {
     #[tokio::test]
     async fn without_a_disk_memory_is_the_bound() {
         let (spool, _received) = spool(100, None);
-        spool.keep(job(0), result(0));
-        spool.keep(job(1), result(1));
+        spool.keep(job(0), Payload::of(result(0)));
+        spool.keep(job(1), Payload::of(result(1)));
         assert_eq!(spool.news(), None, "80 B are no more than 100 B");
-        spool.keep(job(2), result(2));
+        spool.keep(job(2), Payload::of(result(2)));
         assert_eq!((spool.news(), spool.news()), (Some(true), None), "said once");
-        spool.keep(job(2), result(2));
+        spool.keep(job(2), Payload::of(result(2)));
         assert_eq!(spool.state().memory_bytes, 120, "a repetition is the same result");
         spool.discard(job(1));
         assert_eq!(spool.news(), Some(false));
@@ -368,8 +357,8 @@ mod tests {
     async fn a_disk_that_takes_nothing_loses_nothing() {
         let gone = tempfile::tempdir().unwrap().path().join("gone");
         let (spool, mut received) = spool(50, Some((&gone, 1_000)));
-        spool.keep(job(0), result(0));
-        spool.keep(job(1), result(1));
+        spool.keep(job(0), Payload::of(result(0)));
+        spool.keep(job(1), Payload::of(result(1)));
         spilled(&mut received).await;
         assert_eq!(spool.news(), Some(true), "memory alone is full");
         for index in 0..2 {
@@ -381,9 +370,9 @@ mod tests {
     async fn the_disk_has_a_bound_too() {
         let folder = tempfile::tempdir().unwrap();
         let (spool, mut received) = spool(0, Some((folder.path(), 40)));
-        spool.keep(job(0), result(0));
+        spool.keep(job(0), Payload::of(result(0)));
         spilled(&mut received).await;
-        spool.keep(job(1), result(1));
+        spool.keep(job(1), Payload::of(result(1)));
         assert_eq!(spool.news(), Some(true), "the disk is full");
         spool.discard(job(0));
         assert_eq!(spool.news(), None, "twice the memory's room is exceeded as well");

@@ -8,8 +8,8 @@ use std::{
 
 use bytes::Bytes;
 use farm_core::{
-    id::{ContentHash, NodeId, NodeSession},
-    message::{AppToNode, Contact, JobTicket, NodeToApp, ResultHeader},
+    id::{ContentHash, JobAttempt, NodeId, NodeSession},
+    message::{AppToNode, Contact, JobTicket, NodeToApp, ResultAck, ResultHeader},
 };
 use proto::{
     codec::{content_hash, pack_programs},
@@ -190,7 +190,9 @@ impl Links {
         match message {
             AppToNode::Jobs(tickets) => send_jobs(sender, tickets, programs),
             AppToNode::Hello { .. } => send_frame(sender, message, vec![self.capability.clone()]),
-            AppToNode::Acks(_) | AppToNode::Cancel(_) => send_frame(sender, message, Vec::new()),
+            AppToNode::Acks(_) | AppToNode::Cancel(_) | AppToNode::Holding(_) => {
+                send_frame(sender, message, Vec::new())
+            }
         }
     }
 }
@@ -248,7 +250,7 @@ async fn run_link(link: NewLink, room: ResultRoom, inputs: mpsc::Sender<Input>) 
             if inputs.send(Input::NodeConnected { key, sender: sender.clone() }).await.is_err() {
                 return;
             }
-            let reason = listen(key, receiver, &room, &inputs).await;
+            let reason = listen(key, receiver, &sender, &room, &inputs).await;
             sender.close(&reason);
             reason
         }
@@ -262,6 +264,7 @@ async fn run_link(link: NewLink, room: ResultRoom, inputs: mpsc::Sender<Input>) 
 async fn listen(
     key: LinkKey,
     mut receiver: LinkReceiver<NodeToApp>,
+    sender: &LinkSender<AppToNode>,
     room: &ResultRoom,
     inputs: &mpsc::Sender<Input>,
 ) -> String {
@@ -272,9 +275,22 @@ async fn listen(
         }
         let mut received = Vec::with_capacity(frames.len());
         for Frame { header, payload } in frames.drain(..) {
-            if let Err(reason) = check(&header, &payload).await {
-                return reason;
-            }
+            let digest = match check(&header, &payload).await {
+                Ok(Checked::Good) => match &header {
+                    NodeToApp::Result(result) => result.digest,
+                    NodeToApp::Welcome { .. } | NodeToApp::Refused { .. } | NodeToApp::Inventory(_) => {
+                        ContentHash::EMPTY
+                    }
+                },
+                Ok(Checked::Broken { job, found }) => {
+                    tracing::warn!(%job, "a result does not have its digest");
+                    // The node sends it again; if what it has is broken, it has the job made again.
+                    let acks = vec![ResultAck { job, digest: found }];
+                    send_frame(sender, AppToNode::Acks(acks), Vec::new());
+                    continue;
+                }
+                Err(reason) => return reason,
+            };
             let permit = match room.try_take(payload.len()) {
                 Some(permit) => permit,
                 None => {
@@ -286,10 +302,6 @@ async fn listen(
                     room.take(payload.len()).await
                 }
             };
-            let digest = match &header {
-                NodeToApp::Result(result) => result.digest,
-                NodeToApp::Welcome { .. } | NodeToApp::Refused { .. } => ContentHash::EMPTY,
-            };
             received.push(Received { message: header, payload: Payload { bytes: payload, digest, permit } });
         }
         if inputs.send(Input::NodeSaid { key, received }).await.is_err() {
@@ -300,11 +312,20 @@ async fn listen(
 
 const CLOSED: &str = "the application has closed";
 
-/// Whether a result's payload is what its header says. The text of an error is for the node and the log.
-async fn check(message: &NodeToApp, payload: &Bytes) -> Result<(), String> {
+/// What is found of a payload.
+#[derive(Debug, PartialEq, Eq)]
+enum Checked {
+    /// It is what its header says.
+    Good,
+    /// It has another digest than its header says.
+    Broken { job: JobAttempt, found: ContentHash },
+}
+
+/// Whether a result's payload is what its header says. An error is a breach of the protocol; its text is for the node and the log.
+async fn check(message: &NodeToApp, payload: &Bytes) -> Result<Checked, String> {
     let NodeToApp::Result(ResultHeader { job, outcome: Ok(sections), digest, .. }) = message else {
         return if payload.is_empty() {
-            Ok(())
+            Ok(Checked::Good)
         } else {
             Err("a payload came with a message that has none".to_owned())
         };
@@ -323,7 +344,7 @@ async fn check(message: &NodeToApp, payload: &Bytes) -> Result<(), String> {
         let digest = tokio::task::spawn_blocking(move || content_hash(&payload)).await;
         digest.map_err(|error| format!("the result of {job} could not be digested: {error}"))?
     };
-    if found == *digest { Ok(()) } else { Err(format!("the result of {job} does not have its digest")) }
+    Ok(if found == *digest { Checked::Good } else { Checked::Broken { job: *job, found } })
 }
 
 impl ResultRoom {
@@ -351,7 +372,7 @@ impl ResultRoom {
 #[cfg(test)]
 mod tests {
     use farm_core::{
-        id::{AppId, Attempt, DeviceIndex, Epoch, JobAttempt, JobId, JobIndex, TaskId},
+        id::{AppId, Attempt, DeviceIndex, Epoch, JobId, JobIndex, TaskId},
         message::JobFailure,
     };
 
@@ -374,10 +395,11 @@ mod tests {
             let payload = Bytes::from(vec![5_u8; size]);
             let digest = content_hash(&payload);
             let length = size as u64;
-            assert_eq!(check(&result(vec![length], digest), &payload).await, Ok(()));
-            let wrong = check(&result(vec![length], ContentHash([1; 32])), &payload).await.unwrap_err();
+            assert_eq!(check(&result(vec![length], digest), &payload).await, Ok(Checked::Good));
+            let broken = check(&result(vec![length], ContentHash([1; 32])), &payload).await;
+            assert!(matches!(broken, Ok(Checked::Broken { found, .. }) if found == digest), "got {broken:?}");
+            let wrong = check(&result(vec![length, 4], digest), &payload).await.unwrap_err();
             assert!(wrong.contains("1/0/3"), "the job is named: {wrong}");
-            assert!(check(&result(vec![length, 4], digest), &payload).await.is_err());
             assert!(check(&result(vec![u64::MAX, length + 1], digest), &payload).await.is_err());
         }
         let refused = NodeToApp::Refused { reason: String::new() };
@@ -390,7 +412,7 @@ mod tests {
             panic!("made as a result")
         };
         let failed = NodeToApp::Result(ResultHeader { outcome: Err(JobFailure::Timeout), ..header });
-        assert_eq!(check(&failed, &Bytes::new()).await, Ok(()));
+        assert_eq!(check(&failed, &Bytes::new()).await, Ok(Checked::Good));
         assert!(check(&failed, &Bytes::from_static(b"x")).await.is_err());
     }
 

@@ -395,6 +395,7 @@ impl Driver {
                     self.runs.reached();
                 }
                 NodeToApp::Refused { reason } => self.not_reached(key.node, reason),
+                NodeToApp::Inventory(_) => {}
             }
             self.ledger.handle(now, Event::FromNode { node: key.node, session: key.session, message });
         }

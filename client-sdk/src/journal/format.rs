@@ -56,6 +56,12 @@ pub(super) fn encode_header(label: &str) -> Vec<u8> {
     bytes
 }
 
+/// Whether a crash can have left these bytes where a header was being written: some are missing or zero, none is another's.
+pub(super) fn is_torn(bytes: &[u8], header: &[u8]) -> bool {
+    bytes.len() <= header.len()
+        && bytes.iter().zip(header).all(|(found, meant)| *found == 0 || found == meant)
+}
+
 /// Bytes of the whole header, by its first [`FIXED_HEADER_BYTES`].
 pub(super) fn header_bytes(fixed: &[u8]) -> Result<usize, HeaderFault> {
     let mut fields = Fields(fixed);

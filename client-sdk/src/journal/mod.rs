@@ -400,7 +400,7 @@ fn begin_or_read(file: &File, label: &str) -> Result<Contents, Fault> {
     let header = format::encode_header(label);
     let length = file.metadata()?.len();
     let beginning = read_at(file, 0, length.min(header.len() as u64))?;
-    if beginning.len() < header.len() && header.starts_with(&beginning) {
+    if length <= header.len() as u64 && beginning != header && format::is_torn(&beginning, &header) {
         file.write_all_at(&header, 0)?;
         return Ok(Contents::Begun { length: header.len() as u64 });
     }

@@ -198,6 +198,25 @@ fn a_hole_in_what_was_not_synced_is_a_torn_end() {
     assert!(damaged.to_string().contains("three"), "the file is named: {damaged}");
 }
 
+/// A crash may leave a file's length without its bytes.
+#[test]
+fn a_header_that_a_crash_left_out_is_written_again() {
+    let folder = TempDir::new().unwrap();
+    let path = folder.path().join("journal");
+    let header = format::encode_header(LABEL);
+    for zeros in [0..header.len(), 10..header.len(), 0..16] {
+        let mut torn = header.clone();
+        torn[zeros].fill(0);
+        fs::write(&path, &torn).unwrap();
+        append(&path, &[&[7]]);
+        assert_eq!(read(&path).unwrap(), [7]);
+    }
+    let zeros = vec![0; header.len() + 1];
+    fs::write(&path, &zeros).unwrap();
+    assert!(matches!(Journal::open(&path, LABEL), Err(JournalError::NotAJournal { .. })));
+    assert_eq!(fs::read(&path).unwrap(), zeros, "longer than a header: somebody else's");
+}
+
 #[test]
 fn journals_of_others_are_refused_and_left_alone() {
     let folder = TempDir::new().unwrap();

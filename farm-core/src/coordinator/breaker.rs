@@ -21,7 +21,7 @@ const MOST_CRASHES_UNPROVEN: u32 = 8;
 const MOST_CRASHES_PROVEN: u32 = 32;
 
 /// How long a stopped application gets no devices, in milliseconds. Then it may try again.
-const STOPPED_MS: u64 = 60_000;
+pub(super) const STOPPED_MS: u64 = 60_000;
 
 /// Whether an application gets devices.
 #[derive(Debug)]
@@ -115,6 +115,7 @@ impl CoordinatorMachine {
         app.breaker = Breaker::Open { until, reason: reason.clone() };
         let jobs: Vec<JobId> = app.jobs.keys().map(|key| key.in_app(id)).collect();
         self.withdraw(jobs);
+        self.keep_stopped(now, id, until, &reason);
         self.tell_app(id, CoordinatorToApp::Stopped { reason });
     }
 }

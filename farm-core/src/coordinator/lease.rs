@@ -76,6 +76,7 @@ impl CoordinatorMachine {
     /// Acts on every deadline that is due.
     pub(super) fn expire(&mut self, now: Instant) {
         self.expire_nodes(now);
+        self.ask_for_missing(now);
         self.expire_apps(now);
         self.expire_steals(now);
         self.expire_questions(now);
@@ -87,9 +88,12 @@ impl CoordinatorMachine {
     pub(super) fn rearm(&mut self) {
         let liveness = self.config.liveness;
         let nodes = self.nodes.values().flat_map(|node| {
-            let recheck = node.recheck.as_ref().map(|recheck| recheck.at);
             let silence = silence_deadline(&liveness, node);
-            [Some(self.guarded_until.map_or(silence, |until| silence.max(until))), node.full_until, recheck]
+            [
+                Some(self.guarded_until.map_or(silence, |until| silence.max(until))),
+                node.full_until,
+                node.ask_at,
+            ]
         });
         let apps = self.apps.values().flat_map(|app| {
             let lease = match app.link {
@@ -107,7 +111,6 @@ impl CoordinatorMachine {
     fn expire_nodes(&mut self, now: Instant) {
         let liveness = self.config.liveness;
         let mut dead = Vec::new();
-        let mut rechecks = Vec::new();
         let mut relieved = false;
         let mut silent = 0;
         for (&id, node) in &mut self.nodes {
@@ -115,7 +118,6 @@ impl CoordinatorMachine {
                 node.full_until = None;
                 relieved = true;
             }
-            rechecks.extend(node.recheck.take_if(|recheck| recheck.at <= now).map(|recheck| (id, recheck)));
             let silence = now.since(node.last_heard);
             let at_least = |bound_ms| silence >= Duration::from_millis(bound_ms);
             silent += usize::from(node.link.is_none() || at_least(liveness.suspect_ms));
@@ -126,9 +128,6 @@ impl CoordinatorMachine {
                 None if at_least(liveness.reconnect_ms) => dead.push((id, Blame::OldestOnEachDevice)),
                 Some(_) | None => {}
             }
-        }
-        for (id, recheck) in rechecks {
-            self.recheck(id, recheck);
         }
         self.declare_dead(now, silent, dead);
         if relieved {

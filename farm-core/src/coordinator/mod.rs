@@ -5,13 +5,16 @@
 //!
 //! Split by event family: `registry` (who is there), `placement` (where jobs go, by a `policy`; `consult` asks plug-ins),
 //! `report` (what ended), `replan` (what was lost), `steal` (what moves between nodes), `speculate` (what runs twice at the tail),
-//! `breaker` (which application is stopped), `lease` (who is silent), `contents` (who has and brings which data), `status` (what
-//! operators see), `timeline` (what ran when and where). `model` holds the state they share, `rates` what devices are worth.
+//! `breaker` (which application is stopped), `lease` (who is silent), `contents` (who has and brings which data), `durable` (what
+//! outlives it), `status` (what operators see), `timeline` (what ran when and where). `model` holds the state they share, `rates`
+//! what devices are worth.
 
 mod breaker;
 mod consult;
 mod contents;
+pub mod durable;
 mod invariants;
+mod inventory;
 mod lease;
 mod model;
 mod neighbours;
@@ -35,6 +38,7 @@ use serde::{Deserialize, Serialize};
 use self::{
     consult::{Asked, PluginFaults},
     contents::Spreads,
+    durable::{Durable, Keep, Restored},
     model::{App, Node, Peer, Pending, Placement},
     policy::{Choice, History, Question, QuestionId},
     rates::Modules,
@@ -67,6 +71,8 @@ pub struct CoordinatorConfig {
     pub plugins: BTreeSet<String>,
     /// Seed of the machine's one generator.
     pub seed: u64,
+    /// What earlier lives kept.
+    pub restored: Restored,
 }
 
 impl CoordinatorConfig {
@@ -80,6 +86,7 @@ impl CoordinatorConfig {
             max_crashes: 3,
             plugins: BTreeSet::new(),
             seed,
+            restored: Restored::default(),
         }
     }
 }
@@ -158,6 +165,8 @@ pub enum Effect {
         /// What is asked.
         question: Question,
     },
+    /// Keep something over this process's death: soon is enough, and several at once.
+    Keep(Keep),
 }
 
 /// How a node stands.
@@ -316,6 +325,8 @@ pub struct CoordinatorMachine {
     /// Jobs that lost their place during the current event.
     lost: BTreeMap<(AppId, BatchId), Vec<JobKey>>,
     recovery: Recovery,
+    /// What outlives this coordinator, beside its epoch.
+    durable: Durable,
     /// Who has large contents, and who brings them where.
     spreads: Spreads,
     /// Retract orders without an answer; at most one for each thief.
@@ -360,6 +371,7 @@ impl CoordinatorMachine {
             plugin_faults: BTreeMap::new(),
             lost: BTreeMap::new(),
             recovery: Recovery::default(),
+            durable: Durable::default(),
             spreads: Spreads::default(),
             steals: BTreeMap::new(),
             next_steal: 1,
@@ -380,6 +392,7 @@ impl CoordinatorMachine {
     /// Takes one event in.
     pub fn handle(&mut self, now: Instant, event: Event) {
         self.begin_recovery(now);
+        self.restore(now);
         let speaker = match event {
             Event::FromApp { link, message } => {
                 self.app_said(now, link, message);
@@ -488,6 +501,8 @@ impl CoordinatorMachine {
             }
             NodeToCoordinator::Locate(content) => self.locate(now, node, content),
             NodeToCoordinator::CacheChanged { held, gone } => self.cache_changed(now, node, &held, &gone),
+            NodeToCoordinator::Holding(held) => self.holding(node, held),
+            NodeToCoordinator::Inventory(held) => self.inventory(now, node, &held),
             NodeToCoordinator::Goodbye => {
                 self.close(link);
                 self.node_leaves(now, node);

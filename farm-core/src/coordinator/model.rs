@@ -6,6 +6,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use super::{
     NodeState,
     breaker::Breaker,
+    inventory::Missing,
     neighbours::Samples,
     policy::Policy,
     rates::{Load, Module, Modules, Throughput},
@@ -26,6 +27,9 @@ use crate::{
 /// Most contents that a node is remembered to hold; beyond it the smallest hashes are forgotten: the node is then taken
 /// for colder than it is.
 const MAX_KNOWN_CONTENTS: usize = 4_096;
+
+/// A job is overdue when it has taken this many times what it should. Tiles of one picture differ by less than that.
+const OVERDUE: f64 = 3.0;
 
 /// Who is at the other end of a connection.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -174,8 +178,10 @@ pub(super) struct Node {
     pub(super) state: NodeState,
     /// Gave a job back while not draining: gets nothing new until then.
     pub(super) full_until: Option<Instant>,
-    /// Jobs that a hello's inventory lacked because they were in transit, or so it seemed: looked at once more then.
-    pub(super) recheck: Option<Recheck>,
+    /// Jobs that it should hold and did not, because they were in transit, or so it seemed.
+    pub(super) missing: BTreeMap<JobId, Missing>,
+    /// Then it is asked for them again.
+    pub(super) ask_at: Option<Instant>,
     /// Jobs placed or executed here.
     pub(super) jobs: BTreeSet<JobId>,
     /// What it holds of earlier coordinators' plans, and its applications have not asked for yet.
@@ -203,7 +209,8 @@ impl Node {
             last_heard: now,
             state: NodeState::Alive,
             full_until: None,
-            recheck: None,
+            missing: BTreeMap::new(),
+            ask_at: None,
             jobs: BTreeSet::new(),
             brought: BTreeMap::new(),
             contents: BTreeSet::new(),
@@ -269,13 +276,6 @@ impl Node {
     }
 }
 
-/// Attempts whose whereabouts are in doubt until a deadline.
-#[derive(Debug)]
-pub(super) struct Recheck {
-    pub(super) at: Instant,
-    pub(super) jobs: Vec<(JobId, Attempt)>,
-}
-
 /// A device of a node.
 #[derive(Debug)]
 pub(super) struct Device {
@@ -308,14 +308,16 @@ impl Device {
     }
 
     /// When it will be done with what it has, in nanoseconds from now: what is queued, less what of the first job must be
-    /// done already.
+    /// done already. A first job that takes far longer than it should is taken to need as long again as it is overdue: then
+    /// either the job or the device is not what it was taken for, and nothing else will tell before it ends.
     pub(super) fn free_at_ns(&self, now: Instant, modules: &Modules) -> f64 {
         if self.planned_jobs == 0 {
             return 0.0;
         }
         let queued_ns = self.throughput.queued_ns(modules);
         let elapsed_ns = now.since(self.busy_since).as_nanos() as f64;
-        queued_ns - elapsed_ns.min(queued_ns / self.planned_jobs as f64)
+        let first_ns = queued_ns / self.planned_jobs as f64;
+        queued_ns - elapsed_ns.min(first_ns) + (elapsed_ns - OVERDUE * first_ns).max(0.0)
     }
 
     pub(super) fn add_load(&mut self, now: Instant, load: Load) {

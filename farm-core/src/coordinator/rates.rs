@@ -26,6 +26,9 @@ const MAX_RATE_STEP: f64 = 16.0;
 const FAR_OFF: f64 = 2.0;
 const CHANGED_AFTER: i8 = 4;
 
+/// So many samples make a mean that is worth keeping.
+const SETTLED_SAMPLES: u32 = 4;
+
 /// What a point of score is taken to be worth before any job was completed: a device of score 1,000 has speed 1.0, as
 /// simulated devices have. Only what is weighed against other times, such as a transfer's, depends on it.
 const UNKNOWN_SCALE: f64 = 1e-3;
@@ -135,6 +138,21 @@ struct ModuleThroughput {
 impl Throughput {
     pub(super) const fn new(score: f64) -> Self {
         Self { score, speed: Mean::NONE, modules: Vec::new() }
+    }
+
+    /// How much faster than its score says, over all modules; `None` before a job was completed.
+    pub(super) const fn speed(&self) -> Option<f64> {
+        self.speed.value
+    }
+
+    /// The same, once enough jobs say so.
+    pub(super) fn settled_speed(&self) -> Option<f64> {
+        self.speed.value.filter(|_| self.speed.samples >= SETTLED_SAMPLES)
+    }
+
+    /// How much faster than its score says it was once; counts as one sample.
+    pub(super) const fn presume(&mut self, speed: f64) {
+        self.speed.presume(Mean { value: Some(speed), samples: 1, off_in_a_row: 0 });
     }
 
     /// Load of a module per nanosecond.

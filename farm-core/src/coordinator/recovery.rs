@@ -57,6 +57,12 @@ pub(super) struct Brought {
     executed: bool,
 }
 
+impl Brought {
+    pub(super) const fn of(&self, job: JobId) -> JobAttempt {
+        JobAttempt { job, attempt: self.attempt }
+    }
+}
+
 impl CoordinatorMachine {
     /// The first event starts the time in which nodes are waited for: as long as silence may last.
     pub(super) fn begin_recovery(&mut self, now: Instant) {

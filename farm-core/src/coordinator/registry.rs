@@ -4,7 +4,6 @@ use std::{collections::BTreeMap, time::Duration};
 
 use super::{
     CoordinatorMachine, Effect, NodeState,
-    breaker::Breaker,
     model::{App, Node, Peer},
     policy::{BUILT_IN, Policy},
     replan::Blame,
@@ -67,6 +66,7 @@ impl CoordinatorMachine {
             Some(false) => self.fence(now, id, &hello),
             None => {
                 self.nodes.insert(id, Node::new(&hello, now));
+                self.recall_speeds(id);
             }
         }
         let Some(node) = self.nodes.get_mut(&id) else { return };
@@ -239,7 +239,7 @@ impl CoordinatorMachine {
             jobs: BTreeMap::new(),
             failed: BTreeMap::new(),
             unreachable: BTreeMap::new(),
-            breaker: Breaker::new(),
+            breaker: self.breaker_of(now, id),
             waiting_jobs: 0,
             delivered_jobs: 0,
             device_time_ns: 0,
@@ -294,6 +294,7 @@ impl CoordinatorMachine {
         let kept = self.inherited(id, hello);
         self.remove_node(now, id, Blame::OldestOnEachDevice);
         self.nodes.insert(id, Node::new(hello, now));
+        self.recall_speeds(id);
         self.inherit(now, id, &kept);
     }
 

@@ -7,7 +7,7 @@ use std::{
 
 use super::{
     CoordinatorMachine, NodeState,
-    model::{Job, JobState, Recheck},
+    model::{Job, JobState},
 };
 use crate::{
     id::{AppId, Attempt, ContentHash, DeviceIndex, JobAttempt, JobId, JobKey, NodeId, NodeSession, TaskId},
@@ -63,63 +63,6 @@ impl CoordinatorMachine {
             } else {
                 self.requeue(job, Some(id));
             }
-        }
-    }
-
-    /// Compares what a node says it holds with what it should hold.
-    pub(super) fn reconcile(&mut self, now: Instant, id: NodeId, inventory: &[JobAttempt]) {
-        let held: BTreeMap<JobId, Attempt> = inventory.iter().map(|item| (item.job, item.attempt)).collect();
-        self.settle_interrupted_steals(id, &held);
-        let Some(node) = self.nodes.get(&id) else { return };
-        let mut doubtful = Vec::new();
-        for &job in &node.jobs {
-            let Some((_, attempt)) = self.holder(job) else { continue };
-            if held.get(&job) != Some(&attempt) {
-                doubtful.push((job, attempt));
-            }
-        }
-        // The report that explains it, or the job itself, may still be on its way: wait as long as for a silent node.
-        if !doubtful.is_empty() {
-            let at = now.after(Duration::from_millis(self.config.liveness.dead_ms));
-            if let Some(node) = self.nodes.get_mut(&id) {
-                node.recheck = Some(Recheck { at, jobs: doubtful });
-            }
-            self.arm(at);
-        }
-        let mut stale = Vec::new();
-        let mut left: BTreeSet<AppId> = BTreeSet::new();
-        for item in inventory {
-            match self.apps.get(&item.job.app) {
-                None => {
-                    left.insert(item.job.app);
-                }
-                Some(_) if !self.answers_for(id, *item) && !self.may_be_adopted(id, *item) => {
-                    stale.push(*item);
-                }
-                Some(_) => {}
-            }
-        }
-        if !stale.is_empty() {
-            self.tell_node(id, CoordinatorToNode::Cancel { jobs: stale });
-        }
-        // Applications of an earlier coordinator may come back to this one; those of our own epoch are gone.
-        let issued_before = self.issued_before();
-        for app in left.into_iter().filter(|app| app.0 > issued_before) {
-            self.tell_node(id, CoordinatorToNode::AppLeft { app });
-        }
-    }
-
-    /// The deadline of [`Recheck`]: what is still unexplained gets a new attempt.
-    pub(super) fn recheck(&mut self, id: NodeId, recheck: Recheck) {
-        let mut cancelled = Vec::new();
-        for (job, attempt) in recheck.jobs {
-            if self.holder(job) == Some((id, attempt)) {
-                cancelled.push(JobAttempt { job, attempt });
-                self.requeue(job, None);
-            }
-        }
-        if !cancelled.is_empty() {
-            self.tell_node(id, CoordinatorToNode::Cancel { jobs: cancelled });
         }
     }
 

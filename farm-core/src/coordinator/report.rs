@@ -168,13 +168,13 @@ impl CoordinatorMachine {
         &mut self,
         now: Instant,
         id: NodeId,
-        device: DeviceIndex,
+        index: DeviceIndex,
         job: JobId,
         load: Load,
         device_time_ns: u64,
     ) {
-        let place = (id, device);
-        let Some(device) = self.nodes.get_mut(&id).and_then(|node| node.device_mut(device)) else { return };
+        let place = (id, index);
+        let Some(device) = self.nodes.get_mut(&id).and_then(|node| node.device_mut(index)) else { return };
         let point_ns = device.completed(now, &mut self.modules, load, device_time_ns);
         let Some(app) = self.apps.get_mut(&job.app) else { return };
         app.device_time_ns = app.device_time_ns.saturating_add(device_time_ns);
@@ -189,6 +189,7 @@ impl CoordinatorMachine {
         if app.policy == Policy::History {
             self.history.note(&app.name, job.index, point_ns);
         }
+        self.keep_speeds(id, index);
     }
 
     fn node_full(&mut self, now: Instant, id: NodeId) {

@@ -12,7 +12,10 @@ mod kept;
 mod nodes;
 mod session;
 
-use std::collections::{BTreeMap, BTreeSet, VecDeque};
+use std::{
+    collections::{BTreeMap, BTreeSet, VecDeque},
+    time::Duration,
+};
 
 use self::{
     jobs::{Batch, Job},
@@ -28,7 +31,7 @@ use crate::{
     },
     message::{
         AppHello, AppToCoordinator, AppToNode, Contact, CoordinatorToApp, CostNs, JobFailure, LatencyClass,
-        NodeToApp, Priority, WaitReason,
+        Liveness, NodeToApp, Priority, WaitReason,
     },
     program::Content,
     time::Instant,
@@ -221,6 +224,8 @@ pub struct Ledger {
     nodes: BTreeMap<NodeLife, Node>,
     /// When a node's link wants to be looked at again.
     deadlines: BTreeMap<NodeLife, Instant>,
+    /// Time between comparisons of what nodes hold, by the last welcome.
+    compare_every: Duration,
     /// Nodes with something to flush.
     dirty: BTreeSet<NodeLife>,
     /// Answers to re-plans that came too late, to be flushed.
@@ -249,6 +254,7 @@ impl Ledger {
             next_batch: 0,
             nodes: BTreeMap::new(),
             deadlines: BTreeMap::new(),
+            compare_every: Liveness::default().compare_every(),
             dirty: BTreeSet::new(),
             already_delivered: Vec::new(),
             counts: LedgerCounts::default(),

@@ -2,12 +2,13 @@
 //! It never decides whether a result counts.
 
 use std::{
-    collections::{BTreeMap, VecDeque},
+    collections::{BTreeMap, BTreeSet, VecDeque},
     time::Duration,
 };
 
 use super::{Effect, Ledger, jobs::Placement, session::Session};
 use crate::{
+    holding::Holding,
     id::{Attempt, ContentHash, JobAttempt, JobKey, NodeId, NodeSession, TaskId},
     message::{AppToCoordinator, AppToNode, Contact, JobTicket, NodeToApp, PROTOCOL_VERSION, ResultAck},
     time::Instant,
@@ -59,7 +60,7 @@ pub(super) enum Link {
 pub(super) struct Node {
     pub(super) contact: Contact,
     pub(super) link: Link,
-    /// Tries since the link last stood.
+    /// Tries since the link last stood for a while, or brought a result.
     tries: u32,
     /// Until when a link is tried for.
     try_until: Instant,
@@ -69,6 +70,10 @@ pub(super) struct Node {
     unsent: VecDeque<Attempt>,
     acks: Vec<ResultAck>,
     cancels: Vec<JobAttempt>,
+    /// It is time to say what should be there.
+    compare: bool,
+    /// The link stood: results may be there whose acknowledgement got lost, and that it repeats on the next one.
+    may_keep_results: bool,
 }
 
 impl Node {
@@ -77,6 +82,11 @@ impl Node {
     fn answer_by(&self, now: Instant) -> Instant {
         let timeout = now.after(Duration::from_millis(CONNECT_TIMEOUT_MS));
         if self.try_until > now { timeout.min(self.try_until) } else { timeout }
+    }
+
+    /// Whether there is anything to have a link for.
+    fn is_wanted(&self) -> bool {
+        !self.outstanding.is_empty() || self.may_keep_results
     }
 }
 
@@ -123,6 +133,8 @@ impl Ledger {
             unsent: VecDeque::new(),
             acks: Vec::new(),
             cancels: Vec::new(),
+            compare: false,
+            may_keep_results: false,
         });
         node.outstanding.insert(attempt, key);
     }
@@ -131,7 +143,7 @@ impl Ledger {
     pub(super) fn leaves_node(&mut self, place: Placement) {
         let Some(node) = self.nodes.get_mut(&place.life) else { return };
         node.outstanding.remove(&place.attempt);
-        if node.outstanding.is_empty() && matches!(node.link, Link::Backoff | Link::Unreachable) {
+        if !node.is_wanted() && matches!(node.link, Link::Backoff | Link::Unreachable) {
             self.nodes.remove(&place.life);
             self.deadlines.remove(&place.life);
         }
@@ -158,23 +170,24 @@ impl Ledger {
         node.acks.clear();
         node.cancels.clear();
         self.dirty.remove(&life);
-        if node.outstanding.is_empty() {
+        match node.link {
+            Link::Open => node.try_until = now.after(Duration::from_millis(MAX_RECONNECT_MS)),
+            Link::Connecting | Link::Greeting => {}
+            Link::Backoff | Link::Unreachable => return,
+        }
+        let gives_up = node.tries >= MAX_CONNECT_TRIES || node.try_until <= now;
+        if gives_up {
+            node.link = Link::Unreachable;
+            node.may_keep_results = false;
+            node.unsent.clear();
+            self.deadlines.remove(&life);
+        }
+        if !node.is_wanted() {
             self.nodes.remove(&life);
             self.deadlines.remove(&life);
             return;
         }
-        match node.link {
-            Link::Open => {
-                node.tries = 0;
-                node.try_until = now.after(Duration::from_millis(MAX_RECONNECT_MS));
-            }
-            Link::Connecting | Link::Greeting => {}
-            Link::Backoff | Link::Unreachable => return,
-        }
-        if node.tries >= MAX_CONNECT_TRIES || node.try_until <= now {
-            node.link = Link::Unreachable;
-            node.unsent.clear();
-            self.deadlines.remove(&life);
+        if gives_up {
             self.say_unreachable(life);
             return;
         }
@@ -187,7 +200,7 @@ impl Ledger {
         match message {
             NodeToApp::Welcome { node, session } => {
                 if life == (NodeLife { node, session }) {
-                    self.node_welcomed(life);
+                    self.node_welcomed(now, life);
                 } else {
                     // Another process answers at the address: the life we look for is over.
                     self.drop_link(now, life);
@@ -197,7 +210,11 @@ impl Ledger {
                 tracing::warn!(node = %life.node, reason, "node refused the link");
                 self.drop_link(now, life);
             }
-            NodeToApp::Result(header) => self.result(life, header),
+            NodeToApp::Result(header) => {
+                self.nodes.entry(life).and_modify(|node| node.tries = 0);
+                self.result(life, header);
+            }
+            NodeToApp::Inventory(held) => self.node_holds(life, &held),
         }
     }
 
@@ -206,11 +223,17 @@ impl Ledger {
             self.deadlines.iter().filter(|(_, deadline)| **deadline <= now).map(|(&life, _)| life).collect();
         for life in due {
             self.deadlines.remove(&life);
-            let Some(node) = self.nodes.get(&life) else { continue };
+            let Some(node) = self.nodes.get_mut(&life) else { continue };
             match node.link {
                 Link::Backoff => self.connect(now, life),
                 Link::Connecting | Link::Greeting => self.drop_link(now, life),
-                Link::Open | Link::Unreachable => {}
+                Link::Open => {
+                    node.tries = 0;
+                    node.compare = true;
+                    self.dirty.insert(life);
+                    self.deadlines.insert(life, now.after(self.compare_every));
+                }
+                Link::Unreachable => {}
             }
         }
     }
@@ -232,6 +255,7 @@ impl Ledger {
                 self.tell_node(life, AppToNode::Cancel(chunk.to_vec()));
             }
             self.send_tickets(life, &unsent);
+            self.say_holding(life);
         }
     }
 
@@ -283,16 +307,43 @@ impl Ledger {
         self.push(Effect::Connect { node: life.node, session: life.session, contact });
     }
 
-    fn node_welcomed(&mut self, life: NodeLife) {
+    fn node_welcomed(&mut self, now: Instant, life: NodeLife) {
         let Some(node) = self.nodes.get_mut(&life) else { return };
         if node.link != Link::Greeting {
             return;
         }
         node.link = Link::Open;
-        node.tries = 0;
+        node.may_keep_results = true;
+        node.compare = false;
         // Everything without a result goes (again): the node ignores what it has.
         node.unsent = node.outstanding.keys().copied().collect();
-        self.deadlines.remove(&life);
+        self.deadlines.insert(life, now.after(self.compare_every));
+        self.dirty.insert(life);
+    }
+
+    /// Says what should be at the node, after everything else that is to be said.
+    fn say_holding(&mut self, life: NodeLife) {
+        let (Some(app), Some(node)) = (self.app(), self.nodes.get(&life)) else { return };
+        if !node.compare {
+            return;
+        }
+        let outstanding = node.outstanding.iter();
+        let outstanding = outstanding.map(|(&attempt, key)| JobAttempt { job: key.in_app(app), attempt });
+        let holding: Holding = outstanding.chain(self.unkept_on(life)).collect();
+        self.nodes.entry(life).and_modify(|node| node.compare = false);
+        self.tell_node(life, AppToNode::Holding(holding));
+    }
+
+    /// What a node holds, where it is not what should be there: tickets that got lost are sent again (those of jobs that ended
+    /// badly there, and that the coordinator plans anew, do no harm), and what nobody waits for goes.
+    fn node_holds(&mut self, life: NodeLife, held: &[JobAttempt]) {
+        let kept: BTreeSet<JobAttempt> = self.unkept_on(life).collect();
+        let Some(node) = self.nodes.get_mut(&life).filter(|node| node.link == Link::Open) else { return };
+        let there: BTreeSet<Attempt> = held.iter().map(|job| job.attempt).collect();
+        node.unsent.extend(node.outstanding.keys().filter(|attempt| !there.contains(attempt)));
+        let unwanted =
+            |job: &&JobAttempt| !node.outstanding.contains_key(&job.attempt) && !kept.contains(job);
+        node.cancels.extend(held.iter().filter(unwanted));
         self.dirty.insert(life);
     }
 

@@ -147,6 +147,7 @@ impl Ledger {
             return;
         }
         self.session = Session::Registered(Pulse::new(now, liveness));
+        self.compare_every = liveness.compare_every();
         let before = self.identity.replace(identity);
         if before.is_some_and(|before| before.app != identity.app) {
             // Attempts of another application id can never be answered: nodes hold them under the old id.

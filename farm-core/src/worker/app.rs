@@ -52,15 +52,17 @@ impl WorkerMachine {
             AppToNode::Hello { protocol, app, incarnation } => {
                 return self.app_hello(now, link, protocol, app, incarnation);
             }
-            AppToNode::Jobs(_) | AppToNode::Acks(_) | AppToNode::Cancel(_) => match self.links.get(&link) {
-                Some(&app) => app,
-                None => {
-                    if let AppToNode::Jobs(tickets) = &message {
-                        self.discard_unheld(tickets);
+            AppToNode::Jobs(_) | AppToNode::Acks(_) | AppToNode::Cancel(_) | AppToNode::Holding(_) => {
+                match self.links.get(&link) {
+                    Some(&app) => app,
+                    None => {
+                        if let AppToNode::Jobs(tickets) = &message {
+                            self.discard_unheld(tickets);
+                        }
+                        return self.refuse_app(link, "say hello first".to_owned());
                     }
-                    return self.refuse_app(link, "say hello first".to_owned());
                 }
-            },
+            }
         };
         let own = |job: &JobAttempt| job.job.app == app;
         match message {
@@ -79,7 +81,10 @@ impl WorkerMachine {
                     self.acknowledged(now, ack);
                 }
             }
-            AppToNode::Cancel(jobs) => jobs.into_iter().filter(own).for_each(|job| self.cancel(job)),
+            AppToNode::Cancel(jobs) => {
+                jobs.into_iter().filter(own).for_each(|job| self.cancelled_by_app(now, job));
+            }
+            AppToNode::Holding(theirs) => self.compare(link, app, theirs),
         }
     }
 

@@ -63,6 +63,15 @@ pub(super) enum ContentState {
     Wanted,
 }
 
+/// A job names a content by another size than other jobs do: one of them is wrong, and must not spoil it for the others.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Misnamed {
+    /// It is here: this job is wrong.
+    Certainly(Content),
+    /// It is not here yet.
+    Perhaps,
+}
+
 /// Those of which the coordinator is told.
 pub(super) fn large(contents: &[Content]) -> BTreeMap<ContentHash, u64> {
     let large = contents.iter().filter(|content| content.size_bytes >= LARGE_BYTES);
@@ -70,6 +79,15 @@ pub(super) fn large(contents: &[Content]) -> BTreeMap<ContentHash, u64> {
 }
 
 impl WorkerMachine {
+    /// The first of a new job's contents that others know by another size.
+    pub(super) fn misnamed(&self, contents: &[Content]) -> Option<Misnamed> {
+        contents.iter().find_map(|content| {
+            let holding = self.contents.get(&content.hash).filter(|holding| holding.content != *content)?;
+            let here = holding.state == ContentState::Ready;
+            Some(if here { Misnamed::Certainly(*content) } else { Misnamed::Perhaps })
+        })
+    }
+
     /// Counts a new job's contents. Returns how many are not here.
     pub(super) fn hold_contents(
         &mut self,

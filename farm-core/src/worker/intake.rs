@@ -2,12 +2,14 @@
 
 use super::{
     Effect, WorkerMachine,
+    content::Misnamed,
     drain::Drain,
     job::{HeldJob, HeldState, Spooled},
 };
 use crate::{
     id::{AppId, DeviceIndex, JobAttempt, JobId, LinkId},
     message::{Executed, JobFailure, JobTicket, JobTrace},
+    program::Content,
     time::Instant,
 };
 
@@ -44,7 +46,16 @@ impl WorkerMachine {
             self.refuse(now, device, &ticket, failure);
             return;
         }
-        self.hold(now, link, device, ticket);
+        match self.misnamed(&ticket.contents) {
+            None => self.hold(now, link, device, ticket),
+            Some(Misnamed::Certainly(content)) => {
+                let Content { hash, size_bytes } = content;
+                let reason = format!("content {hash} has not the {size_bytes} B that it is said to have");
+                self.refuse(now, device, &ticket, JobFailure::InvalidProgram(reason));
+            }
+            // Who is right will show when it comes; elsewhere it may be known.
+            Some(Misnamed::Perhaps) => self.give_back_ticket(now, ticket.job, ticket.device),
+        }
     }
 
     /// Takes a job out, whatever it is doing, without a word to anybody but the driver.
@@ -72,18 +83,11 @@ impl WorkerMachine {
     }
 
     pub(super) fn drop_jobs_of(&mut self, app: AppId) {
-        let jobs: Vec<JobAttempt> = self
-            .jobs
-            .range(JobId::range_of(app))
-            .map(|(&job, held)| JobAttempt { job, attempt: held.attempt })
-            .collect();
-        jobs.into_iter().for_each(|job| self.drop_job(job));
+        self.inventory_of(app).into_iter().for_each(|job| self.drop_job(job));
     }
 
     pub(super) fn drop_everything(&mut self) {
-        let jobs: Vec<JobAttempt> =
-            self.jobs.iter().map(|(&job, held)| JobAttempt { job, attempt: held.attempt }).collect();
-        jobs.into_iter().for_each(|job| self.drop_job(job));
+        self.inventory().into_iter().for_each(|job| self.drop_job(job));
     }
 
     pub(super) fn report_failure(

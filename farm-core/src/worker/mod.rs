@@ -14,6 +14,7 @@ mod device;
 mod drain;
 mod intake;
 mod invariants;
+mod inventory;
 mod job;
 mod lottery;
 mod rate;
@@ -230,6 +231,8 @@ pub struct WorkerMachine {
     session: Session,
     node: Option<NodeId>,
     heartbeat_sequence: u64,
+    /// With the first heartbeat from then on the coordinator is told what is held.
+    compare_at: Instant,
     drain: Drain,
     apps: BTreeMap<AppId, App>,
     links: BTreeMap<LinkId, AppId>,
@@ -272,6 +275,7 @@ impl WorkerMachine {
             session: Session::Offline,
             node: None,
             heartbeat_sequence: 0,
+            compare_at: Instant::ZERO,
             drain: Drain::No,
             apps: BTreeMap::new(),
             links: BTreeMap::new(),

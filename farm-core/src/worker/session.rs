@@ -3,7 +3,6 @@
 
 use super::{Effect, WorkerMachine, drain::Drain};
 use crate::{
-    id::JobAttempt,
     message::{CoordinatorToNode, NodeHello, NodeToCoordinator, PROTOCOL_VERSION},
     pulse::{Answers, Pulse},
     time::Instant,
@@ -37,8 +36,7 @@ impl Session {
 impl WorkerMachine {
     pub(super) fn coordinator_connected(&mut self) {
         self.session = Session::Greeting;
-        let inventory =
-            self.jobs.iter().map(|(&job, held)| JobAttempt { job, attempt: held.attempt }).collect();
+        let inventory = self.inventory();
         self.tell_coordinator(NodeToCoordinator::Hello(NodeHello {
             protocol: PROTOCOL_VERSION,
             name: self.config.name.clone(),
@@ -68,6 +66,7 @@ impl WorkerMachine {
                 }
                 self.node = Some(node);
                 self.session = Session::Registered(Pulse::new(now, liveness));
+                self.compare_at = now.after(liveness.compare_every());
                 self.reports.unsend();
                 self.await_announcements(now);
                 self.tell_lost_devices();
@@ -80,6 +79,10 @@ impl WorkerMachine {
             CoordinatorToNode::Retract { steal, jobs } => self.retract(steal, &jobs),
             CoordinatorToNode::Located { content, peer } => self.located(content, peer),
             CoordinatorToNode::Evict { contents } => self.push(Effect::Evict(contents)),
+            CoordinatorToNode::SayInventory => {
+                let held = self.inventory();
+                self.tell_coordinator(NodeToCoordinator::Inventory(held));
+            }
             CoordinatorToNode::Drain => self.start_drain(now),
             CoordinatorToNode::HeartbeatAck { sequence } => {
                 self.reports.confirm(sequence);
@@ -103,6 +106,7 @@ impl WorkerMachine {
             cache: Some(self.cache),
         });
         self.reports.heartbeat_said(self.heartbeat_sequence);
+        self.tell_holding(now);
     }
 
     /// The coordinator may have missed it, or be another one.

@@ -5,6 +5,7 @@ use std::{collections::BTreeMap, time::Duration};
 use farm_core::{
     coordinator::{
         CoordinatorConfig, CoordinatorMachine, Effect, Event, NodeState,
+        durable::{Keep, Restored},
         policy::{Question, QuestionId},
     },
     device::{DeviceInfo, DeviceKind, Features, Limits, Requirements},
@@ -37,8 +38,12 @@ pub(crate) struct Farm {
     pub(crate) speculative: bool,
     /// By node, in order.
     pub(crate) cancelled: Vec<(u64, JobAttempt)>,
+    /// Nodes that were asked what they hold.
+    pub(crate) asked: Vec<u64>,
     /// Nodes that were told where to fetch, and from which address; none is the application.
     pub(crate) located: Vec<(u64, Option<String>)>,
+    /// What is to outlive the coordinator, in order.
+    pub(crate) kept: Vec<Keep>,
 }
 
 impl Farm {
@@ -57,13 +62,33 @@ impl Farm {
             stopped: Vec::new(),
             speculative: false,
             cancelled: Vec::new(),
+            asked: Vec::new(),
             located: Vec::new(),
+            kept: Vec::new(),
         };
         for (node, &score) in (1..).zip(scores) {
             farm.node_joins(node, score);
         }
         farm.say(AppToCoordinator::Hello(AppHello { policy: policy.to_owned(), ..hello() }));
         farm
+    }
+
+    /// Another coordinator takes over a minute at most after this one's time zero, with what this one kept; the application
+    /// resumes, the nodes are still away.
+    pub(crate) fn coordinator_restarts(&mut self) {
+        let app = self.machine.status().apps[0].app;
+        let mut restored = Restored::default();
+        for keep in std::mem::take(&mut self.kept) {
+            match keep {
+                Keep::Stopped(stopped) => restored.stopped.push(stopped),
+                Keep::Speeds(speeds) => restored.speeds.push(speeds),
+            }
+        }
+        let config = CoordinatorConfig { restored, ..CoordinatorConfig::new(Epoch(2), 2) };
+        self.machine = CoordinatorMachine::new(config);
+        self.stopped.clear();
+        let resume = Some((app, AppIncarnation(1)));
+        self.say(AppToCoordinator::Hello(AppHello { resume, ..hello() }));
     }
 
     /// The application dials again.
@@ -130,10 +155,12 @@ impl Farm {
                 Effect::ToNode { link, message: CoordinatorToNode::Cancel { jobs } } => {
                     self.cancelled.extend(jobs.into_iter().map(|job| (link.0, job)));
                 }
+                Effect::ToNode { link, message: CoordinatorToNode::SayInventory } => self.asked.push(link.0),
                 Effect::ToNode { link, message: CoordinatorToNode::Located { peer, .. } } => {
                     self.located.push((link.0, peer.map(|peer| peer.addresses.concat())));
                 }
                 Effect::AskPolicy { id, plugin, question } => self.questions.push((id, plugin, question)),
+                Effect::Keep(keep) => self.kept.push(keep),
                 Effect::ToApp { .. } | Effect::ToNode { .. } | Effect::Close { .. } => {}
             }
         }
@@ -194,6 +221,13 @@ impl Farm {
             cache: Some(CacheFigures::default()),
         };
         self.handle(Event::FromNode { link: LinkId(node), message })
+    }
+
+    /// A node says all that it holds; gives the jobs that are planned because of it.
+    pub(crate) fn inventory(&mut self, node: u64, held: &[JobAttempt]) -> Vec<JobAttempt> {
+        let message = NodeToCoordinator::Inventory(held.to_vec());
+        let planned = self.handle(Event::FromNode { link: LinkId(node), message });
+        planned.into_values().flatten().collect()
     }
 
     pub(crate) fn leaves(&mut self, node: u64) -> BTreeMap<u64, Vec<JobAttempt>> {

@@ -49,8 +49,10 @@ fn a_second_time_they_are_waited_for_again() {
     for node in 1..=4 {
         farm.node_joins(node, 1_000.0);
     }
-    // They came back with nothing, so what they had is planned anew.
-    farm.wait_for_plan();
+    // They came back with nothing, and have nothing later either, so what they had is planned anew.
+    farm.advance_to_ms(13_000);
+    assert_eq!(farm.asked, [1, 2, 3, 4]);
+    assert_eq!((1..=4).map(|node| farm.inventory(node, &[]).len()).sum::<usize>(), 4);
     farm.advance_to_ms(60_000);
     for node in 1..=4 {
         farm.stop_taking(node);

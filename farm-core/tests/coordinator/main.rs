@@ -3,9 +3,11 @@
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on panics")]
 
 mod breaker;
+mod durable;
 mod farm;
 mod guard;
 mod hearing;
+mod inventory;
 mod losses;
 mod policies;
 mod speculation;

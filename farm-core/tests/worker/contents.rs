@@ -1,8 +1,8 @@
 //! Where a node's contents come from: the application, or a node that the coordinator names.
 
 use farm_core::{
-    id::{ContentHash, LinkId},
-    message::{Contact, CoordinatorToNode, NodeToCoordinator},
+    id::{ContentHash, JobAttempt, LinkId},
+    message::{Contact, CoordinatorToNode, JobFailure, NodeToCoordinator},
     program::Content,
     worker::{Event, Provider},
 };
@@ -133,4 +133,25 @@ fn nobody_waits_for_what_does_not_come_here() {
     located(&mut node, None);
     failed(&mut node);
     assert_eq!(told_of_cache(&mut node), [gone()]);
+}
+
+/// Found by reading: jobs waited for bytes that another application had said to be of another size.
+#[test]
+fn a_content_of_another_size_is_its_own_jobs_fault_alone() {
+    const WRONG: Content = Content { hash: SMALL.hash, size_bytes: 5 };
+    let mut node = Node::new(1, true, 1);
+    let told = |node: &Node, job: JobAttempt| {
+        let ended = node.said.iter().filter_map(|said| match said {
+            NodeToCoordinator::Report { executed, .. } => Some(executed),
+            _ => None,
+        });
+        ended.flatten().find(|ended| ended.job == job).and_then(|ended| ended.failure.clone())
+    };
+    let job = node.job_with(vec![SMALL]);
+    let early = node.job_with(vec![WRONG]);
+    assert_eq!(told(&node, early), Some(JobFailure::Returned), "either may be wrong");
+    node.tell(Event::ContentReady(SMALL.hash));
+    let late = node.job_with(vec![WRONG]);
+    assert!(matches!(told(&node, late), Some(JobFailure::InvalidProgram(_))), "this one is");
+    assert_eq!(node.orders(), [(true, 0, job)]);
 }

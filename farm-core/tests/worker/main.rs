@@ -3,6 +3,7 @@
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on panics")]
 
 mod contents;
+mod inventory;
 mod node;
 mod spool;
 mod staging;

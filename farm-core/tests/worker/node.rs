@@ -10,7 +10,7 @@ use farm_core::{
     },
     message::{
         AppToNode, Contact, CoordinatorToNode, CostNs, JobFailure, JobTicket, LatencyClass, Liveness,
-        NodeToCoordinator, PROTOCOL_VERSION, Priority, ResultAck,
+        NodeToApp, NodeToCoordinator, PROTOCOL_VERSION, Priority, ResultAck,
     },
     program::Content,
     time::Instant,
@@ -26,6 +26,8 @@ pub(crate) struct Node {
     /// Orders to the executors, in order: what begins with `true` was handed over, else taken back.
     pub(crate) orders: Vec<(bool, u16, JobAttempt)>,
     pub(crate) said: Vec<NodeToCoordinator>,
+    /// What applications were told to be here.
+    pub(crate) inventories: Vec<(u64, Vec<JobAttempt>)>,
     /// What the driver was asked to bring, and from whom.
     pub(crate) fetches: Vec<(Content, Provider)>,
 }
@@ -57,6 +59,7 @@ impl Node {
             next_job: 0,
             orders: Vec::new(),
             said: Vec::new(),
+            inventories: Vec::new(),
             fetches: Vec::new(),
         };
         node.tell(Event::CoordinatorConnected);
@@ -76,11 +79,24 @@ impl Node {
 
     pub(crate) fn tell(&mut self, event: Event) {
         self.machine.handle(self.now, event);
+        self.settle();
+    }
+
+    /// Acts on the timers that are due.
+    pub(crate) fn timers(&mut self) {
+        self.machine.handle_timeout(self.now);
+        self.settle();
+    }
+
+    fn settle(&mut self) {
         while let Some(effect) = self.machine.poll_effect() {
             match effect {
                 Effect::Execute { job, device, .. } => self.orders.push((true, device.0, job)),
                 Effect::Abort { job, device } => self.orders.push((false, device.0, job)),
                 Effect::ToCoordinator(message) => self.said.push(message),
+                Effect::ToApp { link, message: NodeToApp::Inventory(held) } => {
+                    self.inventories.push((link.0, held));
+                }
                 Effect::Fetch { content, from } => self.fetches.push((content, from)),
                 _ => {}
             }

@@ -38,6 +38,8 @@ pub(super) struct Setup<'a> {
     pub(super) devices: &'a [String],
     /// Most iterations on them.
     pub(super) iterations: u64,
+    /// Points of the curve over iterations: the last ones of [`PARTS`].
+    pub(super) points: usize,
     /// Of the null model.
     pub(super) seed: u64,
     /// Of each measurement, of which the median counts.
@@ -74,6 +76,7 @@ fn counts(devices: usize) -> Vec<usize> {
 
 async fn on_devices(setup: &Setup<'_>, alignment: &Arc<Alignment>) -> anyhow::Result<Option<Figure>> {
     let mut table = output::table(["DEVICES", "ITERATIONS", "SECONDS", "MS/ITERATION", "SPEED-UP"]);
+    let parts = &PARTS[PARTS.len() - setup.points..];
     let mut alone_s = [f64::NAN; PARTS.len()];
     let mut best = None;
     for count in counts(setup.devices.len()) {
@@ -81,7 +84,7 @@ async fn on_devices(setup: &Setup<'_>, alignment: &Arc<Alignment>) -> anyhow::Re
         let farm = start_farm(&shape)?;
         // Contents are there, and kernels compiled.
         run(&farm, setup, alignment, count as u64).await?;
-        for (part, alone_s) in PARTS.into_iter().zip(&mut alone_s) {
+        for (part, alone_s) in parts.iter().zip(&mut alone_s) {
             let iterations = (setup.iterations / part).max(1);
             let (seconds, _) = median_run(&farm, setup, alignment, iterations).await?;
             if count == 1 {

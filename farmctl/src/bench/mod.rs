@@ -115,6 +115,7 @@ async fn measure(arguments: &BenchArgs) -> anyhow::Result<Vec<Figure>> {
                 set: arguments.set,
                 devices: &arguments.devices,
                 iterations: arguments.iterations,
+                points: arguments.points.into(),
                 seed: arguments.seed,
                 runs: runs(1),
             };

@@ -78,6 +78,9 @@ pub struct Liveness {
     /// How long a closed connection may stay closed, in milliseconds.
     #[prost(uint64, tag = "4")]
     pub reconnect_ms: u64,
+    /// Between comparisons of what is held, in milliseconds.
+    #[prost(uint64, tag = "5")]
+    pub compare_ms: u64,
 }
 /// A task allocation or a module.
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
@@ -1756,7 +1759,10 @@ pub mod apps_server {
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct NodeToCoordinator {
     /// One of these.
-    #[prost(oneof = "node_to_coordinator::Message", tags = "1, 2, 3, 4, 5, 6, 7, 8")]
+    #[prost(
+        oneof = "node_to_coordinator::Message",
+        tags = "1, 2, 3, 4, 5, 6, 7, 8, 9, 10"
+    )]
     pub message: ::core::option::Option<node_to_coordinator::Message>,
 }
 /// Nested message and enum types in `NodeToCoordinator`.
@@ -1788,6 +1794,12 @@ pub mod node_to_coordinator {
         /// What the cache holds now, or does no more.
         #[prost(message, tag = "8")]
         CacheChanged(super::CacheChanged),
+        /// What is held, to be compared.
+        #[prost(message, tag = "9")]
+        Holding(super::Holding),
+        /// Answer to `say_inventory`: every attempt held.
+        #[prost(message, tag = "10")]
+        Inventory(super::Attempts),
     }
 }
 /// A node's first message.
@@ -1927,6 +1939,16 @@ pub struct CacheChanged {
     #[prost(uint64, repeated, tag = "3")]
     pub held_size_bytes: ::prost::alloc::vec::Vec<u64>,
 }
+/// A set of attempts.
+#[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct Holding {
+    /// How many.
+    #[prost(uint64, tag = "1")]
+    pub attempts: u64,
+    /// The wrapping sum of their hashes.
+    #[prost(fixed64, tag = "2")]
+    pub sum: u64,
+}
 /// A device is gone.
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct DeviceLost {
@@ -1943,7 +1965,7 @@ pub struct CoordinatorToNode {
     /// One of these.
     #[prost(
         oneof = "coordinator_to_node::Message",
-        tags = "1, 2, 3, 4, 5, 6, 7, 8, 9, 10"
+        tags = "1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11"
     )]
     pub message: ::core::option::Option<coordinator_to_node::Message>,
 }
@@ -1982,6 +2004,9 @@ pub mod coordinator_to_node {
         /// Drop contents that no job needs.
         #[prost(message, tag = "10")]
         Evict(super::Evict),
+        /// Say what is held.
+        #[prost(message, tag = "11")]
+        SayInventory(super::Nothing),
     }
 }
 /// Registered.

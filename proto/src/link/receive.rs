@@ -32,6 +32,8 @@ pub struct LinkReceiver<R> {
     guard: Arc<Guard>,
     small: mpsc::Receiver<Frame<R>>,
     bulk: mpsc::Receiver<Frame<R>>,
+    /// The first small frame was received: until then large ones wait.
+    greeted: bool,
 }
 
 impl<R> fmt::Debug for LinkReceiver<R> {
@@ -52,7 +54,7 @@ impl<R: Header> LinkReceiver<R> {
             opened: watch::Sender::new(false),
         };
         tokio::spawn(accept_streams(Arc::new(inbox)));
-        Self { guard, small, bulk }
+        Self { guard, small, bulk, greeted: false }
     }
 
     /// The next frame. Cancel-safe.
@@ -60,6 +62,9 @@ impl<R: Header> LinkReceiver<R> {
     /// # Errors
     /// The link is over; frames that came before are given first.
     pub async fn recv(&mut self) -> Result<Frame<R>, LinkError> {
+        if let Some(hello) = self.hello().await {
+            return Ok(hello);
+        }
         tokio::select! {
             Some(frame) = self.small.recv() => Ok(frame),
             Some(frame) = self.bulk.recv() => Ok(frame),
@@ -75,6 +80,10 @@ impl<R: Header> LinkReceiver<R> {
     pub async fn recv_many(&mut self, frames: &mut Vec<Frame<R>>, limit: usize) -> Result<(), LinkError> {
         let limit = limit.max(1);
         let end = frames.len() + limit;
+        if let Some(hello) = self.hello().await {
+            frames.push(hello);
+            return Ok(());
+        }
         tokio::select! {
             1.. = self.small.recv_many(frames, limit) => {
                 if frames.len() < end && let Ok(frame) = self.bulk.try_recv() {
@@ -100,13 +109,28 @@ impl<R: Header> LinkReceiver<R> {
     pub fn try_recv(&mut self) -> Result<Option<Frame<R>>, LinkError> {
         use mpsc::error::TryRecvError::{Disconnected, Empty};
         match self.small.try_recv() {
-            Ok(frame) => Ok(Some(frame)),
+            Ok(frame) => {
+                self.greeted = true;
+                Ok(Some(frame))
+            }
+            Err(Empty) if !self.greeted => Ok(None),
             Err(small) => match (small, self.bulk.try_recv()) {
                 (_, Ok(frame)) => Ok(Some(frame)),
                 (Disconnected, Err(Disconnected)) => Err(self.guard.error()),
                 (Empty | Disconnected, Err(Empty | Disconnected)) => Ok(None),
             },
         }
+    }
+
+    /// The first small frame, once; a large one may be there as soon as it is. `None` if it has been received, or never comes.
+    /// Cancel-safe.
+    async fn hello(&mut self) -> Option<Frame<R>> {
+        if self.greeted {
+            return None;
+        }
+        let hello = self.small.recv().await;
+        self.greeted = true;
+        hello
     }
 }
 

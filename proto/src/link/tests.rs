@@ -6,6 +6,7 @@ use std::{
         Arc,
         atomic::{AtomicU64, Ordering},
     },
+    time::Duration,
 };
 
 use bytes::{BufMut, Bytes, BytesMut};
@@ -145,6 +146,24 @@ async fn more_large_frames_than_streams_all_arrive() {
     sending.await.unwrap();
     seen.sort_unstable();
     assert_eq!(seen, (0..40).collect::<Vec<_>>(), "each once");
+}
+
+/// Found by a test that failed once: with both there, either was received first.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn the_hello_is_received_first_though_large_frames_are_there() {
+    let mut links = Vec::new();
+    for _ in 0..16 {
+        let (app, node, server) = linked(ContentSource::empty()).await;
+        app.sender.send(hello(), Vec::new()).await.unwrap();
+        app.sender.send(cancel(1), vec![pattern(200_000)]).await.unwrap();
+        links.push((app, node, server));
+    }
+    // All of it has arrived by then, on most links at least.
+    tokio::time::sleep(Duration::from_millis(100)).await;
+    for (_app, mut node, _server) in links {
+        assert_eq!(node.receiver.recv().await.unwrap().header, hello());
+        assert_eq!(node.receiver.recv().await.unwrap().header, cancel(1));
+    }
 }
 
 #[tokio::test]

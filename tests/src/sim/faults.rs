@@ -266,6 +266,7 @@ impl World {
         self.work.crash_one_in = 0;
         self.work.fetch_fails_one_in = 0;
         self.duplicates = Duplicates::Never;
+        self.lost_one_in = 0;
         self.cuts.clear();
         for (from, to) in self.blocked.clone() {
             self.unblock(from, to);

@@ -16,7 +16,6 @@ use farm_core::{
 use rand::Rng;
 
 use super::{
-    auditor::worker_at,
     faults::keepalive,
     world::{Happening, World},
 };
@@ -26,6 +25,9 @@ const REDIAL: Duration = Duration::from_millis(50);
 
 /// How long a driver waits for an answer to its call before it dials again.
 const DIAL_PATIENCE: Duration = Duration::from_millis(1_000);
+
+/// Pause between two packets that begin a connection of QUIC (RFC 9002, 6.2: it grows; this is a later one).
+const CALL_AGAIN: Duration = Duration::from_millis(500);
 
 /// Latency of a message in a LAN whose hosts are busy, in microseconds.
 const LAN_US: (u64, u64) = (50, 5_000);
@@ -59,6 +61,27 @@ pub enum Message {
     AppToNode(AppToNode),
     /// On a data link.
     NodeToApp(NodeToApp),
+}
+
+/// The first shows it, two more are waited for, and the answer comes late at worst.
+const COMPARISONS_UNTIL_MADE_UP_FOR: u32 = 4;
+
+/// Whether comparisons of what is held make up for the loss of a message on a connection that stands. There are no such losses;
+/// what looks like one would be a mistake of ours.
+const fn can_be_made_up_for(message: &Message) -> bool {
+    match message {
+        Message::AppToNode(message) => {
+            matches!(message, AppToNode::Jobs(_) | AppToNode::Acks(_) | AppToNode::Cancel(_))
+        }
+        Message::NodeToCoordinator(message) => {
+            matches!(message, NodeToCoordinator::Report { .. } | NodeToCoordinator::Retracted { .. })
+        }
+        Message::CoordinatorToNode(message) => {
+            matches!(message, CoordinatorToNode::Cancel { .. } | CoordinatorToNode::Retract { .. })
+        }
+        Message::CoordinatorToApp(message) => matches!(message, CoordinatorToApp::Plan(_)),
+        Message::AppToCoordinator(_) | Message::NodeToApp(_) => false,
+    }
 }
 
 /// Which messages may arrive twice.
@@ -104,6 +127,8 @@ pub(super) struct Link {
     pub(super) listener: Proc,
     /// What the dialler calls it: `None` for the coordinator.
     life: Option<(NodeId, NodeSession)>,
+    /// The dialler knows that it stands.
+    opened: bool,
     /// Messages vanish.
     silent: bool,
     /// This end's process is gone; what it said is still on its way.
@@ -146,9 +171,8 @@ impl World {
         self.after_latency(Happening::Opened { link });
     }
 
-    /// An application dials a node.
-    pub(super) fn dial_node(&mut self, app: usize, node: NodeId, session: NodeSession, address: &str) {
-        let index = worker_at(address);
+    /// An application dials a node, which is worker `index`.
+    pub(super) fn dial_node(&mut self, app: usize, node: NodeId, session: NodeSession, index: usize) {
         let host = &self.workers[index];
         let reachable = host.session == session && host.is_up();
         if !reachable || self.cuts.contains(&(app, index)) {
@@ -156,12 +180,27 @@ impl World {
             self.after_latency(Happening::NotOpened { app, life, node, session });
             return;
         }
-        // Nobody answers: the ledger's own patience ends it.
+        // Nobody answers: the driver repeats its call, until the ledger's patience ends.
         if self.is_blocked(Proc::App(app), Proc::Worker(index)) {
+            let life = self.apps[app].life;
+            self.after(CALL_AGAIN, Happening::CallAgain { app, life, node, session, worker: index });
             return;
         }
         let link = self.add_link(Proc::App(app), Proc::Worker(index), Some((node, session)));
         self.after_latency(Happening::Opened { link });
+    }
+
+    pub(super) fn call_again(
+        &mut self,
+        app: usize,
+        life: u32,
+        node: NodeId,
+        session: NodeSession,
+        worker: usize,
+    ) {
+        if self.apps[app].life == life && self.apps[app].dialling.contains(&(node, session)) {
+            self.dial_node(app, node, session, worker);
+        }
     }
 
     fn add_link(&mut self, dialler: Proc, listener: Proc, life: Option<(NodeId, NodeSession)>) -> LinkId {
@@ -172,13 +211,23 @@ impl World {
             Distances::Mixed => MIXED_US[self.rng.random_range(0..MIXED_US.len())],
         };
         let last_arrival = [self.now; 2];
-        let link = Link { dialler, listener, life, silent: false, gone: None, last_arrival, latency_us };
+        let link = Link {
+            dialler,
+            listener,
+            life,
+            opened: false,
+            silent: false,
+            gone: None,
+            last_arrival,
+            latency_us,
+        };
         self.links.insert(id, link);
         id
     }
 
     pub(super) fn opened(&mut self, id: LinkId) {
-        let Some(link) = self.links.get(&id) else { return };
+        let Some(link) = self.links.get_mut(&id) else { return };
+        link.opened = true;
         match (link.dialler, link.life) {
             (Proc::Worker(index), _) => {
                 self.workers[index].control = Some(id);
@@ -189,6 +238,7 @@ impl World {
                 self.app_event(index, ledger::Event::CoordinatorConnected);
             }
             (Proc::App(index), Some((node, session))) => {
+                self.apps[index].dialling.remove(&(node, session));
                 self.apps[index].nodes.insert((node, session), id);
                 self.app_event(index, ledger::Event::NodeConnected { node, session });
             }
@@ -201,10 +251,21 @@ impl World {
     pub(super) fn send(&mut self, from: Proc, id: LinkId, message: Message) {
         self.audit_said(&message);
         self.excuse(&message);
+        if self.lost_one_in > 0 && can_be_made_up_for(&message) && self.rng.random_ratio(1, self.lost_one_in)
+        {
+            return self.lose(id);
+        }
         let doubled = self.duplicates.one_in(&message).is_some_and(|one_in| self.rng.random_ratio(1, one_in));
         if !doubled || self.send_once(from, id, message.clone()) {
             self.send_once(from, id, message);
         }
+    }
+
+    /// A message is lost, until a comparison shows it, and a second look that it was not merely late.
+    fn lose(&mut self, id: LinkId) {
+        let Some([one, other]) = self.links.get(&id).map(Link::ends) else { return };
+        let noticed = self.now.after(self.setup.liveness.compare_every() * COMPARISONS_UNTIL_MADE_UP_FOR);
+        self.audit.disturbed(noticed, one, other);
     }
 
     /// Puts a message on its way. False if the connection carries none.
@@ -274,9 +335,10 @@ impl World {
         let Some(link) = self.links.remove(&id) else { return };
         for to in link.ends() {
             if let (Proc::App(index), Some(node_life)) = (to, link.life) {
-                let current = self.apps[index].nodes.get(&node_life) == Some(&id);
-                if current {
-                    self.apps[index].nodes.remove(&node_life);
+                let host = &mut self.apps[index];
+                let dialled = !link.opened && host.dialling.contains(&node_life);
+                if dialled || host.nodes.get(&node_life) == Some(&id) {
+                    host.nodes.remove(&node_life);
                     let (node, session) = node_life;
                     let life = self.apps[index].life;
                     self.after_latency(Happening::NotOpened { app: index, life, node, session });

@@ -180,6 +180,19 @@ pub const SCENARIOS: &[Scenario] = &[
         ]),
     },
     Scenario {
+        name: "losses",
+        about: "tickets, acknowledgements, orders and reports are lost on connections that stand; only comparisons tell",
+        story: Story::Weather(&[
+            Kind::Losses,
+            Kind::Distance,
+            Kind::Skew,
+            Kind::Breaks,
+            Kind::Restarts,
+            Kind::Cancels,
+            Kind::Stealing,
+        ]),
+    },
+    Scenario {
         name: "fair",
         about: "three applications of unequal weights that always have work share one node",
         story: Story::Fair,

@@ -37,6 +37,8 @@ pub(super) enum Kind {
     Distance,
     /// Messages arrive twice.
     Doubles,
+    /// Messages are lost on connections that stand. As `Plugins`.
+    Losses,
     /// Workers are killed and started again.
     Restarts,
     /// Workers are killed for good.
@@ -127,7 +129,11 @@ impl Weather {
         let density = [0.1, 0.3, 0.6][rng.random_range(0..3)];
         let policy = policy_of(seed, kinds);
         let interactive = kinds.contains(&Kind::Classes);
-        let kinds: BTreeSet<Kind> = kinds.iter().copied().filter(|_| rng.random_bool(density)).collect();
+        let mut drawn: BTreeSet<Kind> = kinds.iter().copied().filter(|_| rng.random_bool(density)).collect();
+        if kinds.contains(&Kind::Losses) {
+            drawn.insert(Kind::Losses);
+        }
+        let kinds = drawn;
         let has = |kind| kinds.contains(&kind);
         let workers = rng.random_range(2..=5);
         let speeds = |rng: &mut SmallRng| {
@@ -173,6 +179,9 @@ impl Weather {
         }
         if self.has(Kind::Doubles) {
             world.duplicates = Duplicates::Any(self.rng.random_range(2..20));
+        }
+        if self.has(Kind::Losses) {
+            world.lost_one_in = self.rng.random_range(2..20);
         }
         for kind in self.kinds.clone() {
             for _ in 0..self.rng.random_range(1..4) {
@@ -238,6 +247,7 @@ impl Weather {
             }
             Kind::Distance
             | Kind::Doubles
+            | Kind::Losses
             | Kind::Poison
             | Kind::Crashes
             | Kind::Fetches

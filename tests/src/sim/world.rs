@@ -93,6 +93,19 @@ pub enum Happening {
         /// In which life.
         session: NodeSession,
     },
+    /// An application's call of a node is repeated if it has not been answered.
+    CallAgain {
+        /// The application.
+        app: usize,
+        /// In which life.
+        life: u32,
+        /// The node.
+        node: NodeId,
+        /// In which life.
+        session: NodeSession,
+        /// The worker that it is.
+        worker: usize,
+    },
     /// A process dials the coordinator.
     Dial {
         /// Who.
@@ -150,7 +163,8 @@ impl Happening {
             | Self::Closed { .. }
             | Self::NotOpened { .. }
             | Self::Dial { .. } => true,
-            Self::Worker { .. }
+            Self::CallAgain { .. }
+            | Self::Worker { .. }
             | Self::JobDone { .. }
             | Self::App { .. }
             | Self::PluginAnswers { .. }
@@ -253,6 +267,8 @@ pub struct World {
     /// From whom to whom nothing gets through, and nobody is told.
     pub(super) blocked: BTreeSet<(Proc, Proc)>,
     pub(super) duplicates: Duplicates,
+    /// One in this many of the messages that comparisons make up for is lost; none if zero.
+    pub(super) lost_one_in: u32,
     pub(super) distances: Distances,
     pub(super) setup: Setup,
     pub(super) store: Store,
@@ -272,18 +288,24 @@ pub struct World {
 
 /// A tenth of what the design has, so that a run of seconds sees each silence.
 const fn short_liveness() -> message::Liveness {
-    message::Liveness { heartbeat_ms: 100, suspect_ms: 300, dead_ms: 1_000, reconnect_ms: 400 }
+    message::Liveness {
+        heartbeat_ms: 100,
+        suspect_ms: 300,
+        dead_ms: 1_000,
+        reconnect_ms: 400,
+        compare_ms: 500,
+    }
 }
 
 impl World {
     /// A farm that is about to start.
     #[must_use]
     pub fn new(setup: Setup) -> Self {
-        let store = Store { epoch: 1 };
+        let store = Store::new();
         let mut world = Self {
             now: Instant::ZERO,
             rng: SmallRng::seed_from_u64(setup.seed),
-            coordinator: store.coordinator(setup.seed, &setup),
+            coordinator: store.coordinator(Instant::ZERO, setup.seed, &setup),
             workers: Vec::new(),
             apps: Vec::new(),
             work: Work::default(),
@@ -294,6 +316,7 @@ impl World {
             cuts: BTreeSet::new(),
             blocked: BTreeSet::new(),
             duplicates: Duplicates::Never,
+            lost_one_in: 0,
             distances: setup.distances,
             store,
             coordinator_up: true,
@@ -502,8 +525,12 @@ impl World {
             Happening::Closed { link, to, life } => self.told_closed(link, to, life),
             Happening::NotOpened { app, life, node, session } => {
                 if self.apps[app].life == life {
+                    self.apps[app].dialling.remove(&(node, session));
                     self.app_event(app, ledger::Event::NodeLost { node, session });
                 }
+            }
+            Happening::CallAgain { app, life, node, session, worker } => {
+                self.call_again(app, life, node, session, worker);
             }
             Happening::Dial { proc, life } => self.dial_coordinator(proc, life),
             Happening::Worker { worker, life, event } => {

@@ -72,9 +72,10 @@ impl MemoryCache {
         }
     }
 
-    /// Keeps a content until it is released; false if it is not here.
-    pub(super) fn pin(&mut self, hash: ContentHash) -> bool {
-        let Some(entry) = self.entries.get_mut(&hash) else { return false };
+    /// Keeps a content until it is released; false if it is not here, or has another size.
+    pub(super) fn pin(&mut self, Content { hash, size_bytes }: Content) -> bool {
+        let entry = self.entries.get_mut(&hash).filter(|entry| entry.size_bytes == size_bytes);
+        let Some(entry) = entry else { return false };
         if !std::mem::replace(&mut entry.pinned, true) {
             self.idle.remove(&entry.last_use);
         }
@@ -134,7 +135,7 @@ impl MemoryCache {
         mut evicted: impl FnMut(ContentHash),
     ) -> Result<(), CacheFull> {
         let Content { hash, size_bytes } = bytes.content();
-        if self.pin(hash) {
+        if self.pin(bytes.content()) {
             return Ok(());
         }
         while self.bytes + size_bytes > self.cap_bytes {
@@ -169,7 +170,8 @@ mod tests {
         cache.insert(b_bytes, |hash| evicted.push(hash)).unwrap();
         cache.release(a);
         cache.release(b);
-        assert!(cache.pin(a), "a is here");
+        assert!(!cache.pin(Content { hash: a, size_bytes: 39 }), "not of this size");
+        assert!(cache.pin(Content { hash: a, size_bytes: 40 }), "a is here");
         cache.release(a);
         cache.insert(c_bytes, |hash| evicted.push(hash)).unwrap();
         assert_eq!(evicted, [b], "whoever announces contents is told");

@@ -95,8 +95,8 @@ impl Contents {
     }
 
     /// Pins a content that a job needs; false if it is not in memory.
-    pub(crate) fn pin(&mut self, hash: ContentHash) -> bool {
-        let here = self.memory.pin(hash);
+    pub(crate) fn pin(&mut self, content: Content) -> bool {
+        let here = self.memory.pin(content);
         self.figures.memory_hits += u64::from(here);
         here
     }

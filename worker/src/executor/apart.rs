@@ -215,6 +215,7 @@ impl Supervisor {
                 self.book.yielded(now, job);
                 self.tell(DeviceNews::Yielded(job));
             }
+            FromExecutor::Ended(job) => self.book.ended(now, job),
             FromExecutor::Finished { job, device_time_ns, outcome } => {
                 if self.book.finished(now, job) {
                     self.restarts.works();
@@ -237,6 +238,8 @@ impl Supervisor {
             FromExecutor::Opened(_) | FromExecutor::Refused(_) => {
                 return Some(End::Broken("it greeted twice".to_owned()));
             }
+            // The reader puts them together.
+            FromExecutor::Part { .. } => {}
         }
         None
     }

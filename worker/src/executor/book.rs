@@ -50,6 +50,8 @@ enum Stage {
     Running { since: Instant, ran: Duration },
     /// Made way for another one.
     Interrupted { ran: Duration },
+    /// Off the device; its result is on its way.
+    Ended { ran: Duration },
 }
 
 /// A job that ends with its process.
@@ -100,7 +102,11 @@ impl Book {
                 self.remove(job);
                 Aborted::Here
             }
-            Stage::Sent | Stage::Preparing { .. } | Stage::Running { .. } | Stage::Interrupted { .. } => {
+            Stage::Sent
+            | Stage::Preparing { .. }
+            | Stage::Running { .. }
+            | Stage::Interrupted { .. }
+            | Stage::Ended { .. } => {
                 held.aborted = true;
                 Aborted::There
             }
@@ -130,6 +136,13 @@ impl Book {
         self.heard = now;
         let ran = self.find(job).map_or(Duration::ZERO, |held| held.ran(now));
         self.set(job, Stage::Interrupted { ran });
+    }
+
+    /// It has left the device, and its result comes. If the process dies before that it starts over, and is not to blame.
+    pub(super) fn ended(&mut self, now: Instant, job: JobAttempt) {
+        self.heard = now;
+        let ran = self.find(job).map_or(Duration::ZERO, |held| held.ran(now));
+        self.set(job, Stage::Ended { ran });
     }
 
     /// It is over; false if it was not here.
@@ -205,10 +218,10 @@ impl Book {
                 Some(due.max(self.heard).max(compiled) + GRACE)
             }
             // Behind another one it may wait as long as that takes.
-            Stage::Sent | Stage::Interrupted { .. } if !self.is_at_work() => {
+            Stage::Sent | Stage::Interrupted { .. } | Stage::Ended { .. } if !self.is_at_work() => {
                 Some(self.heard + PREPARATION_LIMIT)
             }
-            Stage::Sent | Stage::Waiting | Stage::Interrupted { .. } => None,
+            Stage::Sent | Stage::Waiting | Stage::Interrupted { .. } | Stage::Ended { .. } => None,
         }
     }
 
@@ -219,7 +232,11 @@ impl Book {
     fn preparing_since(&self) -> Option<Instant> {
         self.held.iter().find_map(|held| match held.stage {
             Stage::Preparing { since } => Some(since),
-            Stage::Waiting | Stage::Sent | Stage::Running { .. } | Stage::Interrupted { .. } => None,
+            Stage::Waiting
+            | Stage::Sent
+            | Stage::Running { .. }
+            | Stage::Interrupted { .. }
+            | Stage::Ended { .. } => None,
         })
     }
 
@@ -259,7 +276,7 @@ impl Held {
         match self.stage {
             Stage::Waiting | Stage::Sent | Stage::Preparing { .. } => Duration::ZERO,
             Stage::Running { since, ran } => ran + now.saturating_duration_since(since),
-            Stage::Interrupted { ran } => ran,
+            Stage::Interrupted { ran } | Stage::Ended { ran } => ran,
         }
     }
 }
@@ -315,6 +332,19 @@ mod tests {
         assert_eq!(victims, [crashed(job(0), 1_000_000_000), crashed(job(1), 2_000_000_000)]);
         assert_eq!(next(&mut book, start), Some(job(2)));
         assert_eq!(next(&mut book, start), None);
+    }
+
+    /// Found by reading: a result that was still being written cost its finished job an attempt.
+    #[test]
+    fn who_has_left_the_device_starts_over_without_blame() {
+        let start = Instant::now();
+        let mut book = sent(start, 3);
+        book.runs(start, job(0));
+        book.ended(start + Duration::from_secs(1), job(0));
+        book.runs(start + Duration::from_secs(1), job(1));
+        assert_eq!(book.lost(start + Duration::from_secs(2), "crash"), [crashed(job(1), 1_000_000_000)]);
+        assert_eq!(next(&mut book, start), Some(job(0)));
+        assert_eq!(next(&mut book, start), Some(job(2)));
     }
 
     #[test]

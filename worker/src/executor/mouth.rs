@@ -1,5 +1,6 @@
 //! The writing side of an executor's socket. Small messages are written by whoever says them; a large result is digested
-//! and written by a thread of its own, and the device goes on meanwhile. What is said in that time waits behind it.
+//! and written by a thread of its own, in parts, and the device goes on meanwhile. What is said in that time is written between
+//! two parts: the worker knows at any time which job the device is at.
 
 use std::{
     collections::VecDeque,
@@ -10,17 +11,23 @@ use std::{
 };
 
 use bytes::Bytes;
-use farm_core::{id::JobAttempt, message::JobFailure};
+use farm_core::{
+    id::{ContentHash, JobAttempt},
+    message::JobFailure,
+};
 
 use super::wire::{self, FromExecutor, Output};
-use crate::device::Payload;
+use crate::device::{Payload, size_of};
 
 /// A result of this many bytes is large: writing it takes about as long as waking a thread does a hundred times.
-const LARGE_BYTES: usize = 1 << 20;
+const LARGE_BYTES: u64 = 1 << 20;
 /// Bytes of large results that wait, at most, apart from one; whoever brings more waits.
-const MAX_WAITING_BYTES: usize = 512 << 20;
+const MAX_WAITING_BYTES: u64 = 512 << 20;
 
-/// Says things in the order in which they come.
+/// Bytes of a part: written in about a millisecond.
+const PART_BYTES: usize = 4 << 20;
+
+/// Says things: large results in the order in which they come, everything else at once.
 pub(super) struct Mouth {
     socket: UnixStream,
     /// A lock and a signal: the device's thread, the reading one and the writing one meet here, none of them async.
@@ -32,13 +39,19 @@ pub(super) struct Mouth {
 struct Outgoing {
     /// The thread writes: nobody else may.
     writing: bool,
-    waiting: VecDeque<Said>,
-    waiting_bytes: usize,
+    /// For the next gap between two parts.
+    messages: VecDeque<Vec<u8>>,
+    results: VecDeque<Large>,
+    waiting_bytes: u64,
+    /// The last word, for when all results are written.
+    last: Option<Vec<u8>>,
 }
 
-enum Said {
-    Message(Vec<u8>),
-    Result { job: JobAttempt, device_time_ns: u64, sections: Vec<Bytes> },
+/// A large result.
+struct Large {
+    job: JobAttempt,
+    device_time_ns: u64,
+    sections: Vec<Bytes>,
 }
 
 impl Mouth {
@@ -49,7 +62,7 @@ impl Mouth {
     pub(super) fn open(socket: UnixStream) -> io::Result<Arc<Self>> {
         let mouth = Arc::new(Self { socket, outgoing: Mutex::default(), changed: Condvar::new() });
         let writer = Arc::clone(&mouth);
-        thread::Builder::new().name("results".to_owned()).spawn(move || writer.write_waiting())?;
+        thread::Builder::new().name("results".to_owned()).spawn(move || writer.write_results())?;
         Ok(mouth)
     }
 
@@ -65,19 +78,20 @@ impl Mouth {
     ) -> io::Result<()> {
         match outcome {
             Ok(sections) if size_of(&sections) >= LARGE_BYTES => {
+                self.say(&FromExecutor::Ended(job))?;
                 let mut outgoing = self.outgoing();
                 while outgoing.waiting_bytes > MAX_WAITING_BYTES {
                     outgoing = self.changed.wait(outgoing).unwrap_or_else(PoisonError::into_inner);
                 }
                 outgoing.waiting_bytes += size_of(&sections);
-                outgoing.waiting.push_back(Said::Result { job, device_time_ns, sections });
+                outgoing.results.push_back(Large { job, device_time_ns, sections });
                 outgoing.writing = true;
                 self.changed.notify_all();
                 Ok(())
             }
             Ok(sections) => {
-                let (header, sections) = result(job, device_time_ns, sections);
-                self.say_all(header, &sections)
+                let Payload { sections, digest } = Payload::of(sections);
+                self.say_all(finished(job, device_time_ns, &sections, digest, false), &sections)
             }
             Err(failure) => self.say(&FromExecutor::Finished { job, device_time_ns, outcome: Err(failure) }),
         }
@@ -91,43 +105,78 @@ impl Mouth {
         self.say_all(wire::encode(message), &[])
     }
 
+    /// Says something after which nobody listens any more.
+    ///
+    /// # Errors
+    /// The worker is gone.
+    pub(super) fn say_last(&self, message: &FromExecutor) -> io::Result<()> {
+        let message = wire::encode(message);
+        let mut outgoing = self.outgoing();
+        if outgoing.writing {
+            outgoing.last = Some(message);
+            return Ok(());
+        }
+        self.write(&message, &[])
+    }
+
     fn say_all(&self, header: Vec<u8>, payload: &[Bytes]) -> io::Result<()> {
         let mut outgoing = self.outgoing();
         if outgoing.writing {
             let mut message = header;
             payload.iter().for_each(|part| message.extend_from_slice(part));
-            outgoing.waiting.push_back(Said::Message(message));
+            outgoing.messages.push_back(message);
             return Ok(());
         }
         self.write(&header, payload)
     }
 
-    /// Writes what waits, until the worker is gone: then so is whoever could hear it.
-    fn write_waiting(&self) {
-        loop {
-            let next = {
-                let mut outgoing = self.outgoing();
-                loop {
-                    match outgoing.waiting.pop_front() {
-                        Some(next) => break next,
-                        None => outgoing.writing = false,
-                    }
-                    outgoing = self.changed.wait(outgoing).unwrap_or_else(PoisonError::into_inner);
-                }
-            };
-            let (written, result_bytes) = match next {
-                Said::Message(message) => (self.write(&message, &[]), 0),
-                Said::Result { job, device_time_ns, sections } => {
-                    let (header, sections) = result(job, device_time_ns, sections);
-                    (self.write(&header, &sections), size_of(&sections))
-                }
-            };
-            if written.is_err() {
+    /// Writes results as they come, until the worker is gone: then so is whoever could hear of them.
+    fn write_results(&self) {
+        while let Some(result) = self.next_result() {
+            let size_bytes = size_of(&result.sections);
+            if self.write_in_parts(result).is_err() {
                 return;
             }
-            self.outgoing().waiting_bytes -= result_bytes;
+            self.outgoing().waiting_bytes -= size_bytes;
             self.changed.notify_all();
         }
+    }
+
+    /// Waits for a result, with everything else written before; `None` if the worker is gone.
+    fn next_result(&self) -> Option<Large> {
+        let mut outgoing = self.outgoing();
+        loop {
+            while let Some(message) = outgoing.messages.pop_front() {
+                self.write(&message, &[]).ok()?;
+            }
+            match outgoing.results.pop_front() {
+                Some(result) => return Some(result),
+                None => outgoing.writing = false,
+            }
+            if let Some(last) = outgoing.last.take() {
+                self.write(&last, &[]).ok()?;
+            }
+            outgoing = self.changed.wait(outgoing).unwrap_or_else(PoisonError::into_inner);
+        }
+    }
+
+    fn write_in_parts(&self, Large { job, device_time_ns, sections }: Large) -> io::Result<()> {
+        let of = size_of(&sections);
+        let mut digest = blake3::Hasher::new();
+        for part in sections.iter().flat_map(|section| section.chunks(PART_BYTES)) {
+            self.write_messages()?;
+            let mut socket = &self.socket;
+            socket.write_all(&wire::encode(&FromExecutor::Part { bytes: part.len() as u64, of }))?;
+            socket.write_all(part)?;
+            digest.update(part);
+        }
+        let digest = ContentHash(*digest.finalize().as_bytes());
+        self.write(&finished(job, device_time_ns, &sections, digest, true), &[])
+    }
+
+    fn write_messages(&self) -> io::Result<()> {
+        let messages = std::mem::take(&mut self.outgoing().messages);
+        messages.iter().try_for_each(|message| self.write(message, &[]))
     }
 
     fn write(&self, header: &[u8], payload: &[Bytes]) -> io::Result<()> {
@@ -141,14 +190,15 @@ impl Mouth {
     }
 }
 
-/// A completed job's header as it is written, and its payload.
-fn result(job: JobAttempt, device_time_ns: u64, sections: Vec<Bytes>) -> (Vec<u8>, Vec<Bytes>) {
-    let Payload { sections, digest } = Payload::of(sections);
-    let lengths = sections.iter().map(|section| section.len() as u64).collect();
-    let outcome = Ok(Output { sections: lengths, digest });
-    (wire::encode(&FromExecutor::Finished { job, device_time_ns, outcome }), sections)
-}
-
-fn size_of(sections: &[Bytes]) -> usize {
-    sections.iter().map(Bytes::len).sum()
+/// A completed job's header.
+fn finished(
+    job: JobAttempt,
+    device_time_ns: u64,
+    sections: &[Bytes],
+    digest: ContentHash,
+    in_parts: bool,
+) -> Vec<u8> {
+    let sections = sections.iter().map(|section| section.len() as u64).collect();
+    let outcome = Ok(Output { sections, in_parts, digest });
+    wire::encode(&FromExecutor::Finished { job, device_time_ns, outcome })
 }

@@ -149,8 +149,9 @@ impl Process {
 }
 
 async fn read(mut stream: OwnedReadHalf, said: mpsc::Sender<Said>) {
+    let mut parts = BytesMut::new();
     loop {
-        let message = read_message(&mut stream).await;
+        let message = read_message(&mut stream, &mut parts).await;
         let over = message.is_err();
         if said.send(message).await.is_err() || over {
             return;
@@ -158,22 +159,54 @@ async fn read(mut stream: OwnedReadHalf, said: mpsc::Sender<Said>) {
     }
 }
 
-async fn read_message(stream: &mut OwnedReadHalf) -> Said {
+/// The next message, with its payload. Of a result in parts what has come is in `parts`.
+async fn read_message(stream: &mut OwnedReadHalf, parts: &mut BytesMut) -> Said {
+    loop {
+        let header = read_header(stream).await?;
+        let payload_bytes = header.payload_bytes()?;
+        match &header {
+            FromExecutor::Part { of, .. } => {
+                let all = usize::try_from(*of).map_err(|error| error.to_string())?;
+                if parts.len() + payload_bytes > all {
+                    return Err(format!("more parts came than {all} B"));
+                }
+                parts.reserve(all - parts.len());
+                read_payload(stream, parts, payload_bytes).await?;
+            }
+            FromExecutor::Finished { outcome: Ok(output), .. } if output.in_parts => {
+                let payload = std::mem::take(parts).freeze();
+                if payload.len() != output.bytes()? {
+                    return Err(format!("{} B came in parts of {:?} B", payload.len(), output.sections));
+                }
+                return Ok((header, payload));
+            }
+            _ => {
+                let mut payload = BytesMut::with_capacity(payload_bytes);
+                read_payload(stream, &mut payload, payload_bytes).await?;
+                return Ok((header, payload.freeze()));
+            }
+        }
+    }
+}
+
+async fn read_header(stream: &mut OwnedReadHalf) -> Result<FromExecutor, String> {
     let broken = |error: std::io::Error| error.to_string();
     let mut length = [0; LENGTH_BYTES];
     stream.read_exact(&mut length).await.map_err(broken)?;
     let mut header = vec![0; wire::header_bytes(length)?];
     stream.read_exact(&mut header).await.map_err(broken)?;
-    let header: FromExecutor = wire::decode(&header)?;
-    let payload_bytes = header.payload_bytes()?;
-    let mut payload = BytesMut::with_capacity(payload_bytes);
-    let mut rest = stream.take(payload_bytes as u64);
-    while payload.len() < payload_bytes {
-        if rest.read_buf(&mut payload).await.map_err(broken)? == 0 {
+    wire::decode(&header)
+}
+
+async fn read_payload(stream: &mut OwnedReadHalf, into: &mut BytesMut, bytes: usize) -> Result<(), String> {
+    let end = into.len() + bytes;
+    let mut rest = stream.take(bytes as u64);
+    while into.len() < end {
+        if rest.read_buf(into).await.map_err(|error| error.to_string())? == 0 {
             return Err("it broke off inside a result".to_owned());
         }
     }
-    Ok((header, payload.freeze()))
+    Ok(())
 }
 
 async fn write(mut stream: OwnedWriteHalf, mut outgoing: mpsc::UnboundedReceiver<(Vec<u8>, Option<Bytes>)>) {

@@ -168,7 +168,7 @@ impl Host for Speaker {
             ExecutorEvent::Finished { job, device_time_ns, outcome } => {
                 mouth.finished(job, device_time_ns, outcome)
             }
-            ExecutorEvent::Lost { reason } => mouth.say(&FromExecutor::Lost(reason)),
+            ExecutorEvent::Lost { reason } => mouth.say_last(&FromExecutor::Lost(reason)),
         };
         // A worker that is gone is noticed by the thread that reads.
         let _ = told;

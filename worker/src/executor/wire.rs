@@ -56,7 +56,11 @@ pub(super) enum FromExecutor {
     Yielded(JobAttempt),
     /// As `gpu_exec::ExecutorEvent::Resumed`.
     Resumed(JobAttempt),
-    /// The job ended; the payload is its result, one section after the other.
+    /// The job left the device, and its result is large: it follows in parts, and other words between them.
+    Ended(JobAttempt),
+    /// The payload is the next so many bytes of that result, which has `of` in all.
+    Part { bytes: u64, of: u64 },
+    /// The job ended; the payload is its result, one section after the other, unless it came in parts before.
     Finished { job: JobAttempt, device_time_ns: u64, outcome: Result<Output, JobFailure> },
     /// The device needs a content.
     Wants(ContentHash),
@@ -69,6 +73,8 @@ pub(super) enum FromExecutor {
 pub(super) struct Output {
     /// Lengths of the sections, in bytes.
     pub(super) sections: Vec<u64>,
+    /// They have come in parts before.
+    pub(super) in_parts: bool,
     /// Over all of them.
     pub(super) digest: ContentHash,
 }
@@ -86,9 +92,9 @@ impl Header for ToExecutor {
 impl Header for FromExecutor {
     fn payload_bytes(&self) -> Result<usize, String> {
         match self {
-            Self::Finished { outcome: Ok(output), .. } => {
-                let bytes = output.sections.iter().fold(0, |sum: u64, section| sum.saturating_add(*section));
-                bounded(bytes, ProgramQuota::default().result_bytes)
+            Self::Finished { outcome: Ok(output), .. } if !output.in_parts => output.bytes(),
+            Self::Part { bytes, of } => {
+                bounded(*of, ProgramQuota::default().result_bytes).and_then(|of| bounded(*bytes, of as u64))
             }
             Self::Opened(_)
             | Self::Refused(_)
@@ -97,7 +103,8 @@ impl Header for FromExecutor {
             | Self::Started(_)
             | Self::Yielded(_)
             | Self::Resumed(_)
-            | Self::Finished { outcome: Err(_), .. }
+            | Self::Ended(_)
+            | Self::Finished { .. }
             | Self::Wants(_)
             | Self::Lost(_) => Ok(0),
         }
@@ -105,6 +112,12 @@ impl Header for FromExecutor {
 }
 
 impl Output {
+    /// Bytes of all sections.
+    pub(super) fn bytes(&self) -> Result<usize, String> {
+        let bytes = self.sections.iter().fold(0, |sum: u64, section| sum.saturating_add(*section));
+        bounded(bytes, ProgramQuota::default().result_bytes)
+    }
+
     /// The sections as slices of the payload.
     pub(super) fn cut(&self, mut payload: Bytes) -> Vec<Bytes> {
         let length = |section: &u64| {

@@ -137,6 +137,7 @@ impl From<Liveness> for v1::Liveness {
             suspect_ms: liveness.suspect_ms,
             dead_ms: liveness.dead_ms,
             reconnect_ms: liveness.reconnect_ms,
+            compare_ms: liveness.compare_ms,
         }
     }
 }
@@ -148,6 +149,7 @@ impl From<v1::Liveness> for Liveness {
             suspect_ms: wire.suspect_ms,
             dead_ms: wire.dead_ms,
             reconnect_ms: wire.reconnect_ms,
+            compare_ms: wire.compare_ms,
         }
     }
 }

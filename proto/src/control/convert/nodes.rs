@@ -1,6 +1,7 @@
 //! Worker nodes and the coordinator.
 
 use farm_core::{
+    holding::Holding,
     id::{AppId, ContentHash, Epoch, JobAttempt, NodeId, NodeSession, StealId},
     message::{
         CoordinatorToNode, DeviceLoad, Executed, JobFailure, JobTrace, NodeHello, NodeToCoordinator,
@@ -47,6 +48,10 @@ impl From<NodeToCoordinator> for v1::NodeToCoordinator {
                 gone: gone.into_iter().map(|hash| hash.0.into()).collect(),
             }),
             NodeToCoordinator::Goodbye => Message::Goodbye(v1::Nothing {}),
+            NodeToCoordinator::Holding(Holding { attempts, sum }) => {
+                Message::Holding(v1::Holding { attempts, sum })
+            }
+            NodeToCoordinator::Inventory(held) => Message::Inventory(held.as_slice().into()),
         };
         Self { message: Some(message) }
     }
@@ -93,6 +98,8 @@ impl TryFrom<v1::NodeToCoordinator> for NodeToCoordinator {
                 Self::CacheChanged { held: held(&change)?, gone: hashes("CacheChanged.gone", &change.gone)? }
             }
             Message::Goodbye(v1::Nothing {}) => Self::Goodbye,
+            Message::Holding(v1::Holding { attempts, sum }) => Self::Holding(Holding { attempts, sum }),
+            Message::Inventory(held) => Self::Inventory(held.try_into()?),
         })
     }
 }
@@ -275,6 +282,7 @@ impl From<CoordinatorToNode> for v1::CoordinatorToNode {
                 contents: contents.into_iter().map(|hash| hash.0.into()).collect(),
             }),
             CoordinatorToNode::Drain => Message::Drain(v1::Nothing {}),
+            CoordinatorToNode::SayInventory => Message::SayInventory(v1::Nothing {}),
             CoordinatorToNode::HeartbeatAck { sequence } => {
                 Message::HeartbeatAck(v1::HeartbeatAck { sequence })
             }
@@ -310,6 +318,7 @@ impl TryFrom<v1::CoordinatorToNode> for CoordinatorToNode {
             },
             Message::Evict(evict) => Self::Evict { contents: hashes("Evict.contents", &evict.contents)? },
             Message::Drain(v1::Nothing {}) => Self::Drain,
+            Message::SayInventory(v1::Nothing {}) => Self::SayInventory,
             Message::HeartbeatAck(v1::HeartbeatAck { sequence }) => Self::HeartbeatAck { sequence },
         })
     }

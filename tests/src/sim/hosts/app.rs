@@ -16,6 +16,7 @@ use farm_core::{
 };
 
 use crate::sim::{
+    auditor::worker_at,
     clock::Clock,
     faults::Fault,
     network::{Message, Proc},
@@ -67,6 +68,8 @@ pub struct AppHost {
     pub(in crate::sim) deaf_until: Instant,
     pub(in crate::sim) control: Option<LinkId>,
     pub(in crate::sim) nodes: BTreeMap<(NodeId, NodeSession), LinkId>,
+    /// Nodes that it dials.
+    pub(in crate::sim) dialling: BTreeSet<(NodeId, NodeSession)>,
     programs: BTreeSet<(TaskId, JobIndex)>,
     payloads: BTreeMap<(JobAttempt, ContentHash), u32>,
     /// Who the coordinator said it is; it survives the process.
@@ -100,6 +103,7 @@ impl AppHost {
             deaf_until: Instant::ZERO,
             control: None,
             nodes: BTreeMap::new(),
+            dialling: BTreeSet::new(),
             programs: BTreeSet::new(),
             payloads: BTreeMap::new(),
             identity: None,
@@ -264,6 +268,7 @@ impl World {
         host.state = if back.is_some() { State::Down } else { State::Gone };
         host.control = None;
         host.nodes.clear();
+        host.dialling.clear();
         host.programs.clear();
         host.payloads.clear();
         self.rearm(Proc::App(index));
@@ -301,7 +306,8 @@ impl World {
                 }
             }
             Effect::Connect { node, session, contact } => {
-                self.dial_node(index, node, session, &contact.addresses[0]);
+                host.dialling.insert((node, session));
+                self.dial_node(index, node, session, worker_at(&contact.addresses[0]));
             }
             Effect::ToNode { node, session, message } => {
                 if let AppToNode::Jobs(tickets) = &message {
@@ -315,6 +321,7 @@ impl World {
                 }
             }
             Effect::Disconnect { node, session } => {
+                host.dialling.remove(&(node, session));
                 if let Some(link) = host.nodes.remove(&(node, session)) {
                     self.hang_up(proc, link);
                 }

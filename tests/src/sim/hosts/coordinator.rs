@@ -1,14 +1,16 @@
 //! The coordinator's process, and what it finds on its disk when it starts.
 
-use std::time::Duration;
+use std::{collections::BTreeMap, time::Duration};
 
 use farm_core::{
     coordinator::{
         CoordinatorConfig, CoordinatorMachine, Effect, Event,
+        durable::{Keep, NodeSpeeds, Restored, Stopped},
         policy::{Choice, Question, QuestionId},
     },
     id::{Epoch, LinkId},
     message::CoordinatorToNode,
+    time::Instant,
 };
 use rand::{Rng as _, SeedableRng as _, rngs::SmallRng};
 
@@ -22,20 +24,45 @@ use crate::sim::{
 pub(in crate::sim) const PLUGIN: &str = "plugin";
 
 /// What survives the coordinator's process: what it committed.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Debug)]
 pub(in crate::sim) struct Store {
     pub(in crate::sim) epoch: u32,
+    /// Until when, in the world's time, and what the machine said of it.
+    stopped: Vec<(Instant, Stopped)>,
+    speeds: BTreeMap<String, NodeSpeeds>,
 }
 
 impl Store {
+    pub(in crate::sim) const fn new() -> Self {
+        Self { epoch: 1, stopped: Vec::new(), speeds: BTreeMap::new() }
+    }
+
+    fn keep(&mut self, now: Instant, keep: Keep) {
+        match keep {
+            Keep::Stopped(stopped) => {
+                let until = now.after(Duration::from_millis(stopped.left_ms));
+                self.stopped.push((until, stopped));
+            }
+            Keep::Speeds(speeds) => drop(self.speeds.insert(speeds.node.clone(), speeds)),
+        }
+    }
+
+    fn restored(&self, now: Instant) -> Restored {
+        let left_ms = |until: Instant| u64::try_from(until.since(now).as_millis()).unwrap_or(u64::MAX);
+        let stopped = self.stopped.iter().filter(|(until, _)| *until > now);
+        let stopped = stopped.map(|(until, stopped)| Stopped { left_ms: left_ms(*until), ..stopped.clone() });
+        Restored { stopped: stopped.collect(), speeds: self.speeds.values().cloned().collect() }
+    }
+
     /// A process that starts on this store.
-    pub(in crate::sim) fn coordinator(self, seed: u64, setup: &Setup) -> CoordinatorMachine {
+    pub(in crate::sim) fn coordinator(&self, now: Instant, seed: u64, setup: &Setup) -> CoordinatorMachine {
         let config = CoordinatorConfig::new(Epoch(self.epoch), seed);
         CoordinatorMachine::new(CoordinatorConfig {
             liveness: setup.liveness,
             app_lease_ms: setup.app_lease_ms,
             max_crashes: setup.max_crashes,
             plugins: [PLUGIN.to_owned()].into(),
+            restored: self.restored(now),
             ..config
         })
     }
@@ -65,7 +92,7 @@ impl World {
         self.coordinator_up = true;
         self.audit.coordinator_began(self.store.epoch);
         self.coordinator_clock = self.new_clock();
-        self.coordinator = self.store.coordinator(self.store.epoch.into(), &self.setup);
+        self.coordinator = self.store.coordinator(self.now, self.store.epoch.into(), &self.setup);
         self.rearm(Proc::Coordinator);
     }
 
@@ -94,6 +121,7 @@ impl World {
                     self.note_registration(link, &message);
                     self.send(Proc::Coordinator, link, Message::CoordinatorToNode(message));
                 }
+                Effect::Keep(keep) => self.store.keep(self.now, keep),
                 Effect::Close { link } => self.hang_up(Proc::Coordinator, link),
                 Effect::AskPolicy { id, question, .. } => self.plugin_thinks(id, &question),
             }

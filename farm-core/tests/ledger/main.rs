@@ -1,0 +1,5 @@
+//! The ledger by its rules, driven by hand: which results wait to be kept, what is compared with nodes.
+
+mod application;
+mod compare;
+mod kept;
