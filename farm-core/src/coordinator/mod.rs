@@ -3,7 +3,8 @@
 //! It owns plans, load and fairness; it never owns job payloads, sockets or clocks. A driver feeds events by connection
 //! ([`LinkId`]) and carries the effects out.
 //!
-//! Split by event family: `registry` (who is there), `placement` (where jobs go, by a `policy`; `consult` asks plug-ins),
+//! Split by event family: `registry` (who is there), `placement` (where jobs go, by a `policy`; `consult` asks plug-ins, `reserve`
+//! holds a learning policy's jobs back, `neighbours` says what they will cost), `inventory` (what nodes hold),
 //! `report` (what ended), `replan` (what was lost), `steal` (what moves between nodes), `speculate` (what runs twice at the tail),
 //! `breaker` (which application is stopped), `lease` (who is silent), `contents` (who has and brings which data), `durable` (what
 //! outlives it), `status` (what operators see), `timeline` (what ran when and where). `model` holds the state they share, `rates`

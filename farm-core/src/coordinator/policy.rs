@@ -2,8 +2,8 @@
 //! (10-scheduling.md section 1).
 //!
 //! A policy sees a batch and the devices, and answers a choice for every job. It keeps no books and changes none. Three
-//! are built in (one of them sees a batch in parts: `reserve`); a further kind, the plug-in, is a shared object that the coordinator's driver asks in a process of its
-//! own, and its answer comes as an event.
+//! are built in (two of them see a batch in parts: `reserve`); a further kind, the plug-in, is a shared object that the
+//! coordinator's driver asks in a process of its own, and its answer comes as an event.
 
 use std::collections::BTreeMap;
 

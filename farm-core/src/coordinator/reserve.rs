@@ -1,5 +1,5 @@
-//! Batches of the policies that learn, `neighbours` and `history`: their jobs go out in parts, each when devices are about to run out of the one before, and
-//! the last few for each device at once, packed by what the jobs beside them took.
+//! Batches of the policies that learn, `neighbours` and `history`: their jobs go out in parts, each when devices are about to run
+//! out of the one before, and the last few for each device at once, packed by what the jobs beside them took.
 //!
 //! Jobs go out in an order that is even over the batch at any time. So what has run tells of all that has not, each device
 //! gets jobs from everywhere, and those that come last are as unlike as the batch is: large and small ones, of which shares
