@@ -20,7 +20,8 @@ pub struct FarmOptions {
     /// whenever devices or jobs are unequal.
     pub global_stealing: bool,
     /// The coordinator's placement policy for this application's jobs: `fcfs`, `neighbours` (costs by those of the jobs of
-    /// indices beside theirs), `history` (and by what the same jobs took in the application's last task), or the name of a
+    /// indices beside theirs), `history` (costs of the same jobs of the
+    /// application's last task, longest first), or the name of a
     /// plug-in in the coordinator's folder.
     pub policy: String,
     /// Who the application is in a secured farm; without it, the farm has to be open.

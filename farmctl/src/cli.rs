@@ -155,7 +155,7 @@ pub(crate) struct RenderArgs {
     #[arg(long, default_value_t = 0.0, allow_negative_numbers = true, value_parser = stops)]
     pub exposure: f32,
     /// How the coordinator spreads the jobs: fcfs, neighbours, history, or the name of a plug-in of its own.
-    #[arg(long, value_name = "NAME", default_value = "neighbours")]
+    #[arg(long, value_name = "NAME", default_value = "fcfs")]
     pub policy: String,
     /// How progress is told.
     #[arg(long, value_enum, default_value_t = ProgressStyle::Auto)]

@@ -57,7 +57,8 @@ impl Samples {
             devices.push(*places.entry(sample.place).or_insert(next));
         }
         let times: Vec<f64> = samples.iter().map(|sample| sample.time_per_load).collect();
-        let known: Vec<Known> = samples.iter().map(|sample| Known { index: sample.index, cost: 0.0 }).collect();
+        let known: Vec<Known> =
+            samples.iter().map(|sample| Known { index: sample.index, cost: 0.0 }).collect();
         let mut rates = means(&devices, places.len(), &times);
         let mut fit = Fit { known, devices, times };
         for _ in 0..ROUNDS {
@@ -192,7 +193,11 @@ mod tests {
         for index in (0..JOBS).step_by(3) {
             let device = usize::try_from(index.wrapping_mul(0x9e37_79b9) >> 8).unwrap() % speeds.len();
             let time_ns = (cost(index) / speeds[device] * 1e6).round();
-            #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a few milliseconds")]
+            #[expect(
+                clippy::cast_possible_truncation,
+                clippy::cast_sign_loss,
+                reason = "a few milliseconds"
+            )]
             samples.note(JobIndex(index), place(u16::try_from(device).unwrap()), 1e6, time_ns as u64);
         }
         samples
@@ -205,7 +210,10 @@ mod tests {
         let unit = estimates.rates[&place(0)];
         for (device, speed) in (0_u16..).zip(speeds) {
             let rate = estimates.rates[&place(device)] / unit;
-            assert!((rate / speed - 1.0).abs() < 0.05, "device {device} of speed {speed} is taken for {rate}");
+            assert!(
+                (rate / speed - 1.0).abs() < 0.05,
+                "device {device} of speed {speed} is taken for {rate}"
+            );
         }
         for index in 0..JOBS {
             let told = estimates.cost(JobIndex(index)) / unit;

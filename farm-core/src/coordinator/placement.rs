@@ -9,7 +9,7 @@ use super::{
     CoordinatorMachine, NodeState,
     model::{App, Batch, Job, JobState, Node, Pending, Placement},
     neighbours::Samples,
-    policy::{Choice, Fcfs, PlacementPolicy, Policy, Question, QuestionDevice, QuestionJob},
+    policy::{Choice, Fcfs, LongestFirst, PlacementPolicy, Policy, Question, QuestionDevice, QuestionJob},
     rates::{Load, Module},
     reserve::Low,
 };
@@ -151,7 +151,11 @@ impl CoordinatorMachine {
         let Some(app) = self.apps.get(&pending.app) else { return };
         let choices = match &app.policy {
             Policy::Fcfs => Fcfs.place(&question),
-            Policy::History | Policy::Neighbours => {
+            Policy::History => {
+                self.estimate(&pending, &mut question, None);
+                LongestFirst.place(&question)
+            }
+            Policy::Neighbours => {
                 self.estimate(&pending, &mut question, estimates.as_ref());
                 // What lost its place does not wait for a part.
                 if pending.answers.is_some() {

@@ -2,7 +2,7 @@
 //! (10-scheduling.md section 1).
 //!
 //! A policy sees a batch and the devices, and answers a choice for every job. It keeps no books and changes none. Three
-//! are built in (two of them see a batch in parts: `reserve`); a further kind, the plug-in, is a shared object that the
+//! are built in (one of them sees a batch in parts: `reserve`); a further kind, the plug-in, is a shared object that the
 //! coordinator's driver asks in a process of its own, and its answer comes as an event.
 
 use std::collections::BTreeMap;
@@ -14,7 +14,7 @@ use crate::id::{AppId, DeviceIndex, JobIndex, NodeId, TaskId};
 /// Name of the policy that takes jobs in their order and each to the device that would finish it first.
 pub const FCFS: &str = "fcfs";
 
-/// Name of the policy that also knows what the same job took in the application's last task.
+/// Name of the policy that knows what the same job took in the application's last task.
 pub const HISTORY: &str = "history";
 
 /// Name of the policy that knows what a job takes by what the jobs of indices beside it took.
@@ -98,8 +98,8 @@ impl Policy {
     /// Whether it learns from the jobs of a batch what the others cost, and lets them go out in parts.
     pub(super) const fn learns(&self) -> bool {
         match self {
-            Self::Fcfs | Self::Plugin(_) => false,
-            Self::History | Self::Neighbours => true,
+            Self::Fcfs | Self::History | Self::Plugin(_) => false,
+            Self::Neighbours => true,
         }
     }
 }

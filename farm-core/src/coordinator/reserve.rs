@@ -1,4 +1,4 @@
-//! Batches of the policies that learn, `neighbours` and `history`: their jobs go out in parts, each when devices are about to run
+//! Batches of the policy `neighbours`: their jobs go out in parts, each when devices are about to run
 //! out of the one before, and the last few for each device at once, packed by what the jobs beside them took.
 //!
 //! Jobs go out in an order that is even over the batch at any time. So what has run tells of all that has not, each device
@@ -58,9 +58,8 @@ impl CoordinatorMachine {
         let app = self.apps.get(&pending.app).filter(|app| app.policy.learns())?;
         let batch = app.batches.get(&pending.batch)?;
         let (task, module) = (batch.task, batch.module);
-        let rate = |place: Place| {
-            self.device(place).map(|device| device.throughput.rate(&self.modules, module))
-        };
+        let rate =
+            |place: Place| self.device(place).map(|device| device.throughput.rate(&self.modules, module));
         let estimates = batch.samples.estimates(rate)?;
         for (&(node, index), &rate) in &estimates.rates {
             if let Some(device) = self.nodes.get_mut(&node).and_then(|node| node.device_mut(index)) {

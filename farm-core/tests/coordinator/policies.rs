@@ -80,7 +80,10 @@ fn history_knows_what_the_same_jobs_took_and_puts_the_longest_first() {
 fn an_unknown_policy_is_refused_by_name() {
     let farm = Farm::new("nonesuch", &[1.0]);
     let reason = farm.refused.unwrap();
-    assert!(reason.contains("`nonesuch`") && reason.contains("fcfs, neighbours, history, spread"), "{reason}");
+    assert!(
+        reason.contains("`nonesuch`") && reason.contains("fcfs, neighbours, history, spread"),
+        "{reason}"
+    );
 }
 
 #[test]

@@ -134,7 +134,8 @@ pub(super) async fn measure(seed: u64, runs: usize, pictures: Option<&Path>) -> 
             let runtimes = runtimes.map(|runtime| format!("{runtime:.0} {unit}"));
             [vec![name], runtimes.into(), vec![format!("{gain:.3}")], rest.into()].concat()
         };
-        let reference = [bound_ms, one_queue_ms, neighbours_ms, second_frame_ms].map(|ms| format!("{ms:.0} ms"));
+        let reference =
+            [bound_ms, one_queue_ms, neighbours_ms, second_frame_ms].map(|ms| format!("{ms:.0} ms"));
         table.add_row(row(setting.name.to_owned(), medians_ms, "ms", reference));
         table.add_row(row("  thesis".to_owned(), setting.thesis_s, "s", Default::default()));
         figures.push(Figure::new(setting.gain.0, gain, "ratio", Better::Lower, setting.gain.1));
