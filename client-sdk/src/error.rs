@@ -216,6 +216,7 @@ pub(crate) const fn describe_wait(reason: WaitReason) -> &'static str {
     match reason {
         WaitReason::NoNode => "no node is registered at the coordinator",
         WaitReason::NoFittingDevice => "no device of the farm fulfils the job's requirements",
+        WaitReason::OverQuota => "the application's project has as much of the farm as it may have",
     }
 }
 
@@ -228,6 +229,7 @@ fn describe_failure(failure: &JobFailure) -> String {
         JobFailure::ContentUnavailable(hash) => format!("content {hash} could not be fetched"),
         JobFailure::Poison(reason) => format!("too many attempts ended with their device or node: {reason}"),
         JobFailure::PoisonApplication(reason) => format!("the farm stopped its application: {reason}"),
+        JobFailure::OverQuota(reason) => format!("it needs more than its project may have: {reason}"),
         JobFailure::Returned => "its node gave it back".to_owned(),
         JobFailure::Cancelled => "it was cancelled".to_owned(),
     }

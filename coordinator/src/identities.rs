@@ -77,6 +77,13 @@ impl Identities {
         Err(self.refused("register a node", member, reason))
     }
 
+    /// Writes down that a batch needs more than its project may have.
+    pub(crate) fn refused_by_quota(&self, member: Option<&Member>, reason: &str) {
+        if let Some(member) = member {
+            self.gate.refused("bring jobs", &member.principal, reason);
+        }
+    }
+
     fn refused(&self, what: &str, member: &Member, reason: String) -> String {
         self.gate.refused(what, &member.principal, &reason);
         reason

@@ -15,6 +15,7 @@ mod store;
 mod web;
 
 use std::{
+    collections::BTreeMap,
     hash::{BuildHasher as _, Hasher as _, RandomState},
     net::SocketAddr,
     path::{Path, PathBuf},
@@ -215,6 +216,11 @@ pub async fn start(options: CoordinatorOptions) -> Result<CoordinatorHandle, Sta
     let store = options.state.as_deref().map(Store::open).transpose()?.map(Arc::new);
     let epoch = store.as_deref().map_or_else(|| Ok(epoch_by_the_clock()), Store::begin_epoch)?;
     let restored = store.as_deref().map_or_else(|| Ok(Restored::default()), Store::restore)?;
+    // An open farm has one project, and no operator who could give it a quota.
+    let quotas = match store.as_deref().filter(|_| options.secured) {
+        Some(store) => store.restore_quotas()?,
+        None => BTreeMap::new(),
+    };
     let gate = match (options.secured, &options.state) {
         (false, _) if !options.insecure && store.as_deref().is_some_and(Store::has_members) => {
             return Err(StartError::Trust(format!(
@@ -234,6 +240,7 @@ pub async fn start(options: CoordinatorOptions) -> Result<CoordinatorHandle, Sta
         app_lease_ms: options.app_lease_ms,
         plugins: plugins.names(),
         restored,
+        quotas,
         ..CoordinatorConfig::new(epoch, random_seed())
     };
 

@@ -10,7 +10,8 @@ use farm_core::{
         timeline::{Timeline, TimelineQuery},
     },
     id::{ContentHash, LinkId, NodeId},
-    message::{AppToCoordinator, CoordinatorToApp, CoordinatorToNode, NodeToCoordinator},
+    message::{AppToCoordinator, CoordinatorToApp, CoordinatorToNode, JobFailure, NodeToCoordinator},
+    project::Quota,
     time::Instant,
 };
 use proto::trust::{Capability, Member};
@@ -58,6 +59,10 @@ pub(crate) enum Command {
     Evict(Option<NodeId>, Vec<ContentHash>, oneshot::Sender<bool>),
     /// Asks what ran when and where.
     Timeline(TimelineQuery, oneshot::Sender<Timeline>),
+    /// What a project may have.
+    QuotaSet(String, Quota),
+    /// A project is none any more.
+    ProjectRemoved(String),
     /// Somebody is no member any more, or under another key: its sessions end.
     MembersChanged,
 }
@@ -72,6 +77,10 @@ pub(crate) struct Peer<M> {
     member: Option<Member>,
     /// What an application that comes back has shown.
     shown: Option<Capability>,
+    /// The project of who it is.
+    project: String,
+    /// The last quota that it was refused something for, as it was told.
+    refused: Option<String>,
 }
 
 impl<M> Peer<M> {
@@ -80,8 +89,9 @@ impl<M> Peer<M> {
         alive: oneshot::Sender<()>,
         member: Option<Member>,
         shown: Option<Capability>,
+        project: String,
     ) -> Self {
-        Self { outbound, _alive: alive, member, shown }
+        Self { outbound, _alive: alive, member, shown, project, refused: None }
     }
 
     /// False if the peer does not read or is gone.
@@ -161,7 +171,13 @@ impl Owner {
             Command::FromApp(link, message) => {
                 let Some(peer) = self.apps.get(&link) else { return };
                 match self.identities.check_app(peer.member.as_ref(), peer.shown.as_ref(), &message) {
-                    Ok(()) => self.machine.handle(now, Event::FromApp { link, message }),
+                    Ok(()) => {
+                        if matches!(message, AppToCoordinator::Hello(_)) {
+                            let project = peer.project.clone();
+                            self.machine.handle(now, Event::AppIntroduced { link, project });
+                        }
+                        self.machine.handle(now, Event::FromApp { link, message });
+                    }
                     Err(reason) => self.refuse(now, link, reason),
                 }
             }
@@ -177,6 +193,10 @@ impl Owner {
                     self.machine.handle(now, Event::LinkClosed { link });
                 }
             }
+            Command::QuotaSet(project, quota) => {
+                self.machine.handle(now, Event::QuotaSet { project, quota });
+            }
+            Command::ProjectRemoved(project) => self.machine.handle(now, Event::ProjectRemoved { project }),
             Command::MembersChanged => {
                 let apps = self.apps.iter().map(|(&link, peer)| (link, peer.member.as_ref()));
                 let nodes = self.nodes.iter().map(|(&link, peer)| (link, peer.member.as_ref()));
@@ -247,7 +267,14 @@ impl Owner {
 
     /// Tells an application something, and before it, where it is due, what to show to nodes. False if it does not read.
     fn tell_app(&mut self, link: LinkId, message: CoordinatorToApp) -> bool {
-        let Some(peer) = self.apps.get(&link) else { return true };
+        let Some(peer) = self.apps.get_mut(&link) else { return true };
+        if let CoordinatorToApp::JobFailed { failure: JobFailure::OverQuota(reason), .. } = &message
+            && peer.refused.as_ref() != Some(reason)
+        {
+            // Once for all the jobs of a batch.
+            peer.refused = Some(reason.clone());
+            self.identities.refused_by_quota(peer.member.as_ref(), reason);
+        }
         let capability =
             peer.member.as_ref().and_then(|member| self.identities.capability(link, member, &message));
         capability.is_none_or(|bytes| peer.tell(CoordinatorToApp::Capability(bytes))) && peer.tell(message)
@@ -331,6 +358,17 @@ impl OwnerHandle {
         timeline.await.ok()
     }
 
+    /// Has a project's quota count.
+    pub(crate) async fn quota_set(&self, project: String, quota: Quota) {
+        // An owner that has stopped has no projects.
+        let _ = self.0.send(Command::QuotaSet(project, quota)).await;
+    }
+
+    /// Forgets a project.
+    pub(crate) async fn project_removed(&self, project: String) {
+        let _ = self.0.send(Command::ProjectRemoved(project)).await;
+    }
+
     /// Ends the sessions of those who are no members any more.
     pub(crate) async fn members_changed(&self) {
         // An owner that has stopped has no sessions.
@@ -371,7 +409,7 @@ mod tests {
                 resume: None,
             };
             let said = [
-                Command::AppOpened(link, Peer::new(outbound, alive, None, None)),
+                Command::AppOpened(link, Peer::new(outbound, alive, None, None, String::new())),
                 Command::FromApp(link, AppToCoordinator::Hello(hello)),
                 Command::FromApp(link, AppToCoordinator::Heartbeat { sequence: 1, unanswered: false }),
             ];

@@ -7,10 +7,13 @@ use std::{
     time::{Duration, SystemTime},
 };
 
-use farm_core::id::{AppId, AppIncarnation, Epoch};
+use farm_core::{
+    id::{AppId, AppIncarnation, Epoch},
+    project::DEFAULT_PROJECT,
+};
 use proto::{
     control::{
-        Caller,
+        Caller, quota_change,
         v1::{self, trust_server::Trust},
     },
     trust::{
@@ -123,6 +126,14 @@ impl Gate {
             }
             Err(error) => Err(Status::internal(error.to_string())),
         }
+    }
+
+    /// The project of a caller.
+    pub(crate) fn project_of(&self, member: Option<&Member>) -> Result<String, Status> {
+        let (Self::Members(security), Some(member)) = (self, member) else {
+            return Ok(DEFAULT_PROJECT.to_owned());
+        };
+        security.store.project_of(&member.principal).map_err(|error| Status::internal(error.to_string()))
     }
 
     /// Whether somebody is a member under this key still; a store that cannot be read ends nobody's session.
@@ -279,9 +290,11 @@ impl Trust for TrustService {
             proto::trust::random().map_err(|error| Status::internal(error.to_string()))?;
         let authority = security.authority.fingerprint().to_vec();
         let id = on_disk(move || {
-            let (role, name, uses) = (token.role.clone(), token.name.clone(), token.uses_left);
+            let details = json!({
+                "role": token.role, "name": token.name, "uses": token.uses_left, "project": token.project,
+            });
             let id = security.store.add_token(&secret, token, unix_now())?;
-            let details = json!({ "id": id, "role": role, "name": name, "uses": uses });
+            let details = json!({ "id": id, "token": details });
             security.audit.done("token created", &operator.principal.to_string(), details);
             Ok(id)
         })
@@ -302,6 +315,7 @@ impl Trust for TrustService {
             expires_s: token.expires_s,
             uses_left: token.uses_left,
             maker: token.maker,
+            project: token.project,
         });
         Ok(Response::new(v1::ListTokensResponse { tokens: tokens.collect() }))
     }
@@ -332,8 +346,63 @@ impl Trust for TrustService {
         request: Request<v1::ListMembersRequest>,
     ) -> Result<Response<v1::ListMembersResponse>, Status> {
         let (security, _) = self.operator(&request)?;
-        let uris = on_disk(move || security.store.members()).await?;
-        Ok(Response::new(v1::ListMembersResponse { uris }))
+        let members = on_disk(move || {
+            let mut projects = security.store.belonging()?;
+            let members = security.store.members()?.into_iter();
+            let members = members.map(|uri| {
+                let is_node = uri.parse().is_ok_and(|who: Principal| who.role == Role::Node);
+                let default = if is_node { "" } else { DEFAULT_PROJECT };
+                let project = projects.remove(&uri).unwrap_or_else(|| default.to_owned());
+                v1::MemberStatus { uri, project }
+            });
+            Ok(members.collect())
+        })
+        .await?;
+        Ok(Response::new(v1::ListMembersResponse { members }))
+    }
+
+    async fn set_project(
+        &self,
+        request: Request<v1::SetProjectRequest>,
+    ) -> Result<Response<v1::SetProjectResponse>, Status> {
+        let (security, operator) = self.operator(&request)?;
+        let wrong = |reason: String| Status::invalid_argument(reason);
+        let (project, change) =
+            quota_change(request.into_inner()).map_err(|error| wrong(error.to_string()))?;
+        check_name("project", &project).map_err(|error| wrong(error.to_string()))?;
+        let name = project.clone();
+        let quota = on_disk(move || {
+            let quota = security.store.set_project(&name, change)?;
+            let details = json!({ "project": name, "quota": quota });
+            security.audit.done("project set", &operator.principal.to_string(), details);
+            Ok(quota)
+        })
+        .await?;
+        self.owner.quota_set(project, quota).await;
+        Ok(Response::new(v1::SetProjectResponse { quota: Some(quota.into()) }))
+    }
+
+    async fn remove_project(
+        &self,
+        request: Request<v1::RemoveProjectRequest>,
+    ) -> Result<Response<v1::RemoveProjectResponse>, Status> {
+        let (security, operator) = self.operator(&request)?;
+        let project = request.into_inner().project;
+        let name = project.clone();
+        let known = on_disk(move || {
+            let known = security.store.remove_project(&name)?;
+            if known {
+                let details = json!({ "project": name });
+                security.audit.done("project removed", &operator.principal.to_string(), details);
+            }
+            Ok(known)
+        })
+        .await?;
+        if !known {
+            return Err(Status::not_found(format!("there is no project {project}")));
+        }
+        self.owner.project_removed(project).await;
+        Ok(Response::new(v1::RemoveProjectResponse {}))
     }
 
     async fn expel(&self, request: Request<v1::ExpelRequest>) -> Result<Response<v1::ExpelResponse>, Status> {
@@ -411,6 +480,9 @@ fn token(asked: &v1::CreateTokenRequest, maker: &Principal) -> Result<Token, Sta
             asked.lifetime_s
         )));
     }
+    if role == Role::Node && !asked.project.is_empty() {
+        return Err(wrong("a node belongs to no project: it computes for all of them".to_owned()));
+    }
     let most = if asked.name.is_empty() { MAX_TOKEN_USES } else { 1 };
     if !(1..=most).contains(&asked.uses) {
         return Err(wrong(format!("such a token is used 1 to {most} times, not {}", asked.uses)));
@@ -422,6 +494,7 @@ fn token(asked: &v1::CreateTokenRequest, maker: &Principal) -> Result<Token, Sta
         expires_s: unix_now() + asked.lifetime_s,
         uses_left: asked.uses,
         maker: maker.to_string(),
+        project: asked.project.clone(),
     })
 }
 

@@ -64,6 +64,7 @@ impl Sessions {
         Wire: Send + 'static,
     {
         let member = self.gate.admit(request.extensions(), action)?;
+        let project = self.gate.project_of(member.as_ref())?;
         let shown = request.metadata().get_bin(CAPABILITY_METADATA).and_then(|value| value.to_bytes().ok());
         let shown = self.gate.capability_of(member.as_ref(), shown.as_deref())?;
         let messages = request.into_inner();
@@ -73,7 +74,7 @@ impl Sessions {
         let link = LinkId(self.next_link.fetch_add(1, Ordering::Relaxed));
         let (outbound, outgoing) = mpsc::channel(QUEUED_MESSAGES);
         let (alive, ended) = oneshot::channel();
-        if !self.owner.send(opened(link, Peer::new(outbound.clone(), alive, member, shown))).await {
+        if !self.owner.send(opened(link, Peer::new(outbound.clone(), alive, member, shown, project))).await {
             return Err(Status::unavailable("the coordinator stops"));
         }
         let reader = Reader { link, owner: self.owner.clone(), outbound, ended, _slot: slot };

@@ -3,6 +3,7 @@
 //!
 //! A redb database: what a method has returned is on disk, and after a crash the store is what was committed last.
 
+mod projects;
 mod soft;
 
 use std::{
@@ -24,7 +25,10 @@ use redb::{
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
-use self::soft::{SPEEDS, STOPPED};
+use self::{
+    projects::{BELONGING, PROJECTS},
+    soft::{SPEEDS, STOPPED},
+};
 use crate::StartError;
 
 /// The database in the state directory.
@@ -64,6 +68,9 @@ pub(crate) struct Token {
     pub(crate) uses_left: u32,
     /// Who made it.
     pub(crate) maker: String,
+    /// The project of who joins; empty: none, or `default`.
+    #[serde(default)]
+    pub(crate) project: String,
 }
 
 /// The store did not do what it was asked for.
@@ -196,6 +203,8 @@ impl Store {
             let mut numbers = transaction.open_table(NUMBERS).map_err(broken)?;
             transaction.open_table(TOKENS).map_err(broken)?;
             transaction.open_table(MEMBERS).map_err(broken)?;
+            transaction.open_table(PROJECTS).map_err(broken)?;
+            transaction.open_table(BELONGING).map_err(broken)?;
             transaction.open_table(STOPPED).map_err(broken)?;
             transaction.open_table(SPEEDS).map_err(broken)?;
             let known = numbers.get(EPOCH).map_err(broken)?.is_some();
@@ -212,6 +221,7 @@ impl Store {
         let read = || {
             self.tokens(0)?;
             self.members()?;
+            self.quotas()?;
             self.restored()?;
             self.read(|transaction| {
                 let numbers = transaction.open_table(NUMBERS).map_err(broken)?;
@@ -243,6 +253,7 @@ impl Store {
     pub(crate) fn add_token(&self, secret: &[u8], token: Token, now_s: u64) -> Result<u64, StoreError> {
         let id = self.count(LAST_TOKEN)?;
         self.write(|transaction| {
+            projects::check_known(transaction, &token.project)?;
             let mut tokens = transaction.open_table(TOKENS).map_err(broken)?;
             tokens
                 .retain(|_, text| parse(text).is_ok_and(|token| token.expires_s > now_s))
@@ -316,6 +327,7 @@ impl Store {
             let member = Member::of_certificate(&membership.certificate_der)?;
             let mut members = transaction.open_table(MEMBERS).map_err(broken)?;
             enrol(&mut members, &member, !token.name.is_empty())?;
+            projects::put(transaction, &member.principal, &token.project)?;
             token.uses_left = token.uses_left.saturating_sub(1);
             if token.uses_left == 0 {
                 tokens.remove(key.as_slice()).map_err(broken)?;
@@ -361,6 +373,7 @@ impl Store {
             }
             let mut tokens = transaction.open_table(TOKENS).map_err(broken)?;
             tokens.retain(|_, text| parse(text).is_ok_and(|token| token.maker != uri)).map_err(broken)?;
+            projects::put(transaction, principal, "")?;
             Ok(members.remove(uri.as_str()).map_err(broken)?.is_some())
         })
     }
@@ -371,11 +384,13 @@ impl Store {
         self.members().is_ok_and(|members| members.is_empty()).not()
     }
 
-    /// Forgets members and tokens.
+    /// Forgets members, tokens and projects.
     pub(crate) fn clear(&self) -> Result<(), StoreError> {
         self.write(|transaction| {
             transaction.open_table(TOKENS).map_err(broken)?.retain(|_, _| false).map_err(broken)?;
             transaction.open_table(MEMBERS).map_err(broken)?.retain(|_, _| false).map_err(broken)?;
+            transaction.open_table(BELONGING).map_err(broken)?.retain(|_, _| false).map_err(broken)?;
+            transaction.open_table(PROJECTS).map_err(broken)?.retain(|_, _| false).map_err(broken)?;
             Ok(())
         })
     }
@@ -448,10 +463,12 @@ fn everything(database: &Database) -> Result<Vec<Entry>, redb::Error> {
             entries.push((key.value().to_le_bytes().into(), value.value().into()));
         }
     }
-    if let Some(speeds) = absent(transaction.open_table(SPEEDS))? {
-        for entry in speeds.iter()? {
-            let (key, value) = entry?;
-            entries.push((key.value().into(), value.value().into()));
+    for texts in [SPEEDS, PROJECTS, BELONGING] {
+        if let Some(texts) = absent(transaction.open_table(texts))? {
+            for entry in texts.iter()? {
+                let (key, value) = entry?;
+                entries.push((key.value().into(), value.value().into()));
+            }
         }
     }
     Ok(entries)
@@ -588,7 +605,7 @@ mod tests {
             for token in 0..life {
                 let maker = "x".repeat(300 * token as usize);
                 let (role, name) = ("node".to_owned(), String::new());
-                let token = Token { id: 0, role, name, expires_s: 2, uses_left: 1, maker };
+                let token = Token { id: 0, role, name, expires_s: 2, uses_left: 1, maker, project: String::new() };
                 store.add_token(&life.to_le_bytes(), token, u64::from(life) % 3).unwrap();
             }
             store.remove_token(u64::from(life)).unwrap();
@@ -645,6 +662,7 @@ mod tests {
                 expires_s: NOW_S + 60,
                 uses_left,
                 maker: String::new(),
+                project: String::new(),
             };
             store.add_token(SECRET, token, NOW_S).unwrap();
             Self { _directory: directory, store, authority: Authority::create("farm").unwrap() }

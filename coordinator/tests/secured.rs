@@ -57,7 +57,7 @@ impl Farm {
 }
 
 fn invitation(role: Role, name: Option<&str>) -> Invitation {
-    Invitation { role, name: name.map(str::to_owned), lifetime: Duration::from_secs(60), uses: 1 }
+    Invitation { role, name: name.map(str::to_owned), lifetime: Duration::from_secs(60), uses: 1, project: None }
 }
 
 async fn token(address: &str, operator: &Identity, invitation: &Invitation) -> JoinToken {
@@ -183,6 +183,7 @@ async fn who_was_expelled_or_replaced_is_out_and_memberships_outlive_the_coordin
     control::expel(&farm.address, operator, &uri).await.unwrap();
     assert!(is_denied(control::status(&farm.address, Some(&farm.app)).await), "expelled");
     let members = control::list_members(&farm.address, operator).await.unwrap();
+    let members: Vec<_> = members.into_iter().map(|member| member.uri).collect();
     assert_eq!(members, ["gleaner://farm/node/n", "gleaner://farm/operator/boss"]);
     let again = token(&farm.address, &farm.operator, &invitation(Role::Node, Some("n"))).await;
     let replaced = control::join(&farm.address, &again, None).await.unwrap();

@@ -12,6 +12,7 @@ pub mod id;
 pub mod ledger;
 pub mod message;
 pub mod program;
+pub mod project;
 mod pulse;
 pub mod time;
 pub mod worker;

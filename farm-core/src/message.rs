@@ -13,11 +13,12 @@ use crate::{
         JobIndex, NodeId, NodeSession, StealId, TaskId,
     },
     program::Content,
+    project::AppTerms,
     time::Instant,
 };
 
 /// The protocol this build speaks. A peer of another version is refused at hello.
-pub const PROTOCOL_VERSION: u32 = 5;
+pub const PROTOCOL_VERSION: u32 = 6;
 
 /// Estimated work of a job: nanoseconds on a device of speed 1.0. Zero means unknown.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
@@ -188,6 +189,8 @@ pub enum WaitReason {
     NoNode,
     /// Nodes are there, but no device fulfils the requirements.
     NoFittingDevice,
+    /// The application's project has as much as it may have.
+    OverQuota,
 }
 
 /// Why a job ended without a result.
@@ -208,6 +211,8 @@ pub enum JobFailure {
     /// Too many attempts of the application's jobs in a row ended with their devices, and it was stopped as a whole; the text
     /// names the last one.
     PoisonApplication(String),
+    /// It needs more than its application's project may have at all; the text says of what.
+    OverQuota(String),
     /// Cancelled by the application or by an operator.
     Cancelled,
     /// The node gave the job back unexecuted (it drains, it is full, or the result could not be handed over intact).
@@ -225,7 +230,11 @@ impl JobFailure {
             | Self::OutOfMemory(_)
             | Self::ContentUnavailable(_)
             | Self::Returned => true,
-            Self::InvalidProgram(_) | Self::Poison(_) | Self::PoisonApplication(_) | Self::Cancelled => false,
+            Self::InvalidProgram(_)
+            | Self::Poison(_)
+            | Self::PoisonApplication(_)
+            | Self::OverQuota(_)
+            | Self::Cancelled => false,
         }
     }
 }
@@ -486,8 +495,8 @@ pub enum CoordinatorToNode {
     AppJoined {
         /// Which.
         app: AppId,
-        /// Fair-share weight.
-        weight: f64,
+        /// What it may have; said again when that changes.
+        terms: AppTerms,
     },
     /// Everything of this application can be freed.
     AppLeft {

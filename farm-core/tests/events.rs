@@ -17,6 +17,7 @@ use farm_core::{
         Priority, ResultAck, ResultHeader, WaitReason,
     },
     program::Content,
+    project::{AppTerms, Quota},
     time::Instant,
     worker::{self, WorkerConfig, WorkerMachine},
 };
@@ -100,6 +101,10 @@ fn app_hello(step: Step) -> AppHello {
 }
 
 // -------------------------------------------------------------------------------------------------- coordinator
+
+fn project(step: Step) -> String {
+    ["default", "a", "b", "c"][usize::from(step.two) % 4].to_owned()
+}
 
 fn coordinator_event(step: Step) -> coordinator::Event {
     let link = LinkId(u64::from(step.one) * 2 + u64::from(step.kind % 2));
@@ -195,6 +200,17 @@ fn coordinator_event(step: Step) -> coordinator::Event {
             node: step.three.is_multiple_of(2).then_some(NodeId(step.two.into())),
             contents: (0..step.four).map(|tag| content(tag).hash).collect(),
         },
+        21 | 23 => coordinator::Event::AppIntroduced { link, project: project(step) },
+        25 => coordinator::Event::QuotaSet {
+            project: project(step),
+            quota: Quota {
+                devices: step.three.checked_sub(1).map(u32::from),
+                queued_jobs: step.four.checked_sub(1).map(u64::from),
+                bytes: step.one.checked_sub(1).map(|most| u64::from(most) * 3),
+                weight: step.two.checked_sub(1).map(|most| f64::from(most) + 0.25),
+            },
+        },
+        27 if step.four == 0 => coordinator::Event::ProjectRemoved { project: project(step) },
         _ => coordinator::Event::LinkClosed { link },
     }
 }
@@ -273,7 +289,12 @@ fn worker_event(step: Step) -> worker::Event {
         20 if step.four == 0 => worker::Event::DeviceLost { device, reason: "test".to_owned() },
         21 => worker::Event::FromCoordinator(CoordinatorToNode::AppJoined {
             app: AppId(u64::from(step.one) % 2),
-            weight: f64::from(step.two) + 0.5,
+            terms: AppTerms {
+                project: ["a", "b"][usize::from(step.three % 2 == 0)].to_owned(),
+                result_bytes: (step.four > 0).then_some(u64::from(step.four) * 8),
+                stays: step.four == 2,
+                ..AppTerms::unlimited(f64::from(step.two) + 0.5)
+            },
         }),
         22 if step.four < 2 => {
             worker::Event::FromCoordinator(CoordinatorToNode::AppLeft { app: AppId(u64::from(step.one) % 2) })

@@ -6,9 +6,13 @@ use farm_core::{
         timeline::{Timeline, TimelineQuery},
     },
     id::{ContentHash, NodeId},
+    project::{Quota, QuotaChange},
 };
 use proto::{
-    control::{self, Invitation, SessionError, v1::TokenStatus},
+    control::{
+        self, Invitation, SessionError,
+        v1::{MemberStatus, TokenStatus},
+    },
     trust::{Identity, JoinToken},
 };
 
@@ -95,10 +99,22 @@ impl Admin {
         control::revoke_token(address, identity, id).await.map_err(failure)
     }
 
-    /// The URIs of the farm's members.
-    pub(crate) async fn members(&self) -> Result<Vec<String>, Failure> {
+    /// The farm's members.
+    pub(crate) async fn members(&self) -> Result<Vec<MemberStatus>, Failure> {
         let (address, identity) = self.to();
         control::list_members(address, identity).await.map_err(failure)
+    }
+
+    /// Makes a project, or changes what it may have; gives what it may have now.
+    pub(crate) async fn set_project(&self, project: &str, change: QuotaChange) -> Result<Quota, Failure> {
+        let (address, identity) = self.to();
+        control::set_project(address, identity, project, change).await.map_err(usage)
+    }
+
+    /// Removes a project that nobody belongs to.
+    pub(crate) async fn remove_project(&self, project: &str) -> Result<(), Failure> {
+        let (address, identity) = self.to();
+        control::remove_project(address, identity, project).await.map_err(usage)
     }
 
     /// Ends a membership.

@@ -1,6 +1,6 @@
 //! The command line as typed: raw arguments and their checks, no work.
 
-use std::{path::PathBuf, str::FromStr, time::Duration};
+use std::{fmt::Display, path::PathBuf, str::FromStr, time::Duration};
 
 use clap::{
     Args, Parser, Subcommand, ValueEnum,
@@ -112,6 +112,9 @@ pub(crate) enum Verb {
     /// Look after members.
     #[command(subcommand)]
     Member(MemberVerb),
+    /// Look after projects: whose applications may have how much of the farm.
+    #[command(subcommand)]
+    Project(ProjectVerb),
     /// Measure the farm against its bars.
     Bench(BenchArgs),
     /// Print versions.
@@ -395,6 +398,9 @@ pub(crate) enum TokenVerb {
         /// How often it can be used.
         #[arg(long, default_value_t = 1)]
         uses: u32,
+        /// The project of who joins, of apps and operators [default: the project `default`].
+        #[arg(long, value_name = "NAME")]
+        project: Option<String>,
     },
     /// List the tokens that can still be used.
     Ls,
@@ -426,6 +432,39 @@ pub(crate) enum MemberVerb {
         member: String,
     },
 }
+
+#[derive(Debug, Subcommand)]
+pub(crate) enum ProjectVerb {
+    /// List projects: what each has, and what it may have.
+    Ls,
+    /// Make a project, or change what its applications may have together; what you do not name stays.
+    Set {
+        /// Its name; `default` is the project of those who were put into no other.
+        project: String,
+        /// Devices that its jobs are on at a time; `none` lifts the bound.
+        #[arg(long, value_name = "N|none", value_parser = bound::<u32>)]
+        devices: Option<Bound<u32>>,
+        /// Jobs that are planned at a time and not delivered; the others wait. `none` lifts the bound.
+        #[arg(long, value_name = "N|none", value_parser = bound::<u64>)]
+        queued_jobs: Option<Bound<u64>>,
+        /// Task data and modules of its planned jobs, and on each node results that it has not fetched, such as 500MB or 8GiB;
+        /// `none` lifts the bound.
+        #[arg(long, value_name = "SIZE|none", value_parser = bound_of_size)]
+        bytes: Option<Bound<u64>>,
+        /// What the fair-share weights of its applications come to at most; `none` lifts the bound.
+        #[arg(long, value_name = "WEIGHT|none", value_parser = bound::<f64>)]
+        weight: Option<Bound<f64>>,
+    },
+    /// Remove a project that nobody belongs to and no token is for.
+    Rm {
+        /// Its name.
+        project: String,
+    },
+}
+
+/// A bound, or `none`.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Bound<T>(pub Option<T>);
 
 #[derive(Debug, Args)]
 pub(crate) struct BenchArgs {
@@ -549,6 +588,37 @@ fn duration(text: &str) -> Result<Duration, String> {
     Duration::try_from_secs_f64(number * seconds).map_err(|error| format!("{text:?}: {error}"))
 }
 
+fn bound<T: FromStr<Err: Display>>(text: &str) -> Result<Bound<T>, String> {
+    match text {
+        "none" => Ok(Bound(None)),
+        text => text.parse().map(|most| Bound(Some(most))).map_err(|error| format!("{error}, and not none")),
+    }
+}
+
+fn bound_of_size(text: &str) -> Result<Bound<u64>, String> {
+    if text == "none" { Ok(Bound(None)) } else { size(text).map(|bytes| Bound(Some(bytes))) }
+}
+
+/// Bytes, such as `500MB` or `8GiB`.
+fn size(text: &str) -> Result<u64, String> {
+    let split = text.find(|c: char| !c.is_ascii_digit()).unwrap_or(text.len());
+    let (number, unit) = text.split_at(split);
+    let unit: u64 = match unit {
+        "" | "B" => 1,
+        "kB" => 1_000,
+        "MB" => 1_000_000,
+        "GB" => 1_000_000_000,
+        "TB" => 1_000_000_000_000,
+        "KiB" => 1 << 10,
+        "MiB" => 1 << 20,
+        "GiB" => 1 << 30,
+        "TiB" => 1 << 40,
+        _ => return Err(format!("{text:?}: the unit must be B, kB, MB, GB, TB, KiB, MiB, GiB or TiB")),
+    };
+    let number: u64 = number.parse().map_err(|_| format!("{text:?} is not a size, such as 500MB or 8GiB"))?;
+    number.checked_mul(unit).ok_or_else(|| format!("{text:?} is more than can be counted"))
+}
+
 /// A number from 0 to 1.
 fn share(text: &str) -> Result<f64, String> {
     let share: f64 = text.parse().map_err(|error| format!("{error}"))?;
@@ -582,6 +652,19 @@ mod tests {
         for bad in ["", "x", "5d", "-1s", "1..2s"] {
             assert!(duration(bad).is_err(), "{bad}");
         }
+    }
+
+    #[test]
+    fn sizes_have_units_and_bounds_may_be_none() {
+        assert_eq!(size("7"), Ok(7));
+        assert_eq!(size("500MB"), Ok(500_000_000));
+        assert_eq!(size("8GiB"), Ok(8 << 30));
+        for bad in ["", "x", "GiB", "-1", "1.5GiB", "5gb", "99999999999TiB"] {
+            assert!(size(bad).is_err(), "{bad}");
+        }
+        assert_eq!(bound::<u32>("none"), Ok(Bound(None)));
+        assert_eq!(bound::<u32>("3"), Ok(Bound(Some(3))));
+        assert!(bound::<u32>("-3").is_err() && bound::<u32>("all").is_err());
     }
 
     #[test]

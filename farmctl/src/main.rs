@@ -71,6 +71,7 @@ fn run(cli: &Cli) -> Result<(), Failure> {
             Verb::Join(arguments) => command::membership::join(arguments, target).await,
             Verb::Token(verb) => command::membership::token(verb, target, cli.output).await,
             Verb::Member(verb) => command::membership::member(verb, target, cli.output).await,
+            Verb::Project(verb) => command::project::run(verb, target, cli.output).await,
             Verb::Bench(arguments) => {
                 Box::pin(bench::run(arguments, arguments.output.unwrap_or(cli.output))).await
             }

@@ -175,6 +175,7 @@ const fn waits(now: &Progress) -> Option<&'static str> {
     match now.waiting {
         Some(WaitReason::NoNode) => Some("no node is registered at the coordinator"),
         Some(WaitReason::NoFittingDevice) => Some("no device of the farm fits the jobs"),
+        Some(WaitReason::OverQuota) => Some("your project has as much of the farm as it may have, waiting"),
         None if now.out_of_reach => Some("no node of the farm can be reached from here, trying again"),
         None => None,
     }

@@ -7,6 +7,7 @@ use std::fmt;
 use farm_core::{
     coordinator::{
         AppStatus, ContentStatus, ContentsStatus, DeviceStatus, FarmStatus, NodeState, NodeStatus,
+        ProjectStatus,
         timeline::{Migration, Outcome, Segment, TimelineApp, TimelineHead, TimelineNode},
     },
     device::{DeviceInfo, DeviceKind, Features, Limits, Requirements, SimulatedDevices},
@@ -20,6 +21,7 @@ use farm_core::{
         NodeToCoordinator, Plan, PlanJob, PlanRequest, RunningJob, WaitReason,
     },
     program::Content,
+    project::{AppTerms, Quota},
     time::Instant,
 };
 use proptest::{collection::vec, option, prelude::*};
@@ -124,6 +126,7 @@ fn failure() -> impl Strategy<Value = JobFailure> {
         any::<[u8; 32]>().prop_map(|hash| JobFailure::ContentUnavailable(ContentHash(hash))),
         "\\PC{0,80}".prop_map(JobFailure::Poison),
         "\\PC{0,80}".prop_map(JobFailure::PoisonApplication),
+        "\\PC{0,80}".prop_map(JobFailure::OverQuota),
         Just(JobFailure::Cancelled),
         Just(JobFailure::Returned),
     ]
@@ -195,7 +198,7 @@ fn coordinator_to_app() -> impl Strategy<Value = CoordinatorToApp> {
             CoordinatorToApp::Plan(Plan { batch: batch.map(BatchId), speculative, nodes })
         },
     );
-    let reason = prop::sample::select(vec![WaitReason::NoNode, WaitReason::NoFittingDevice]);
+    let reason = prop::sample::select(vec![WaitReason::NoNode, WaitReason::NoFittingDevice, WaitReason::OverQuota]);
     prop_oneof![
         (any::<(u64, u32, u32)>(), liveness()).prop_map(|((app, life, epoch), liveness)| {
             CoordinatorToApp::Welcome {
@@ -320,8 +323,12 @@ fn coordinator_to_node() -> impl Strategy<Value = CoordinatorToNode> {
         }),
         "\\PC{0,80}".prop_map(|reason| CoordinatorToNode::Refused { reason }),
         Just(CoordinatorToNode::SayInventory),
-        (any::<u64>(), positive())
-            .prop_map(|(app, weight)| CoordinatorToNode::AppJoined { app: AppId(app), weight }),
+        (any::<u64>(), positive(), "\\PC{0,20}", any::<(Option<u64>, bool)>()).prop_map(
+            |(app, weight, project, (result_bytes, stays))| CoordinatorToNode::AppJoined {
+                app: AppId(app),
+                terms: AppTerms { weight, project, result_bytes, stays }
+            }
+        ),
         any::<u64>().prop_map(|app| CoordinatorToNode::AppLeft { app: AppId(app) }),
         attempts().prop_map(|jobs| CoordinatorToNode::Cancel { jobs }),
         (any::<u64>(), attempts())
@@ -332,6 +339,11 @@ fn coordinator_to_node() -> impl Strategy<Value = CoordinatorToNode> {
         Just(CoordinatorToNode::Drain),
         any::<u64>().prop_map(|sequence| CoordinatorToNode::HeartbeatAck { sequence }),
     ]
+}
+
+fn quota() -> impl Strategy<Value = Quota> {
+    (any::<(Option<u32>, Option<u64>, Option<u64>)>(), option::of(positive()))
+        .prop_map(|((devices, queued_jobs, bytes), weight)| Quota { devices, queued_jobs, bytes, weight })
 }
 
 fn farm_status() -> impl Strategy<Value = FarmStatus> {
@@ -358,10 +370,11 @@ fn farm_status() -> impl Strategy<Value = FarmStatus> {
             devices,
             cache,
         });
-    let app = (any::<(u64, bool, [u64; 4])>(), "\\PC{0,20}", positive()).prop_map(
-        |((app, connected, counts), name, weight)| AppStatus {
+    let app = (any::<(u64, bool, [u64; 4])>(), "\\PC{0,20}", "[a-z]{1,9}", positive()).prop_map(
+        |((app, connected, counts), name, project, weight)| AppStatus {
             app: AppId(app),
             name,
+            project,
             weight,
             connected,
             waiting_jobs: counts[0],
@@ -370,8 +383,22 @@ fn farm_status() -> impl Strategy<Value = FarmStatus> {
             device_time_ns: counts[3],
         },
     );
-    (any::<(u32, [u64; 5])>(), vec(node, 0..4), vec(app, 0..4)).prop_map(|((epoch, counts), nodes, apps)| {
+    let project = ("[a-z]{1,9}", quota(), any::<[u64; 5]>(), 0.0..f64::MAX).prop_map(
+        |(project, quota, counts, weight)| ProjectStatus {
+            project,
+            quota,
+            apps: counts[0],
+            devices: counts[1],
+            queued_jobs: counts[2],
+            waiting_jobs: counts[3],
+            bytes: counts[4],
+            weight,
+        },
+    );
+    let parts = (vec(node, 0..4), vec(app, 0..4), vec(project, 0..4));
+    (any::<(u32, [u64; 5])>(), parts).prop_map(|((epoch, counts), (nodes, apps, projects))| {
         FarmStatus {
+            projects,
             epoch: Epoch(epoch),
             nodes,
             apps,

@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use farm_core::{
     coordinator::{
-        AppStatus, DeviceStatus, FarmStatus, NodeState, NodeStatus,
+        AppStatus, DeviceStatus, FarmStatus, NodeState, NodeStatus, ProjectStatus,
         policy::{Choice, Question, QuestionDevice, QuestionJob},
         timeline::{Migration, Outcome, Segment, TimelineApp, TimelineHead, TimelineNode},
     },
@@ -21,6 +21,7 @@ use farm_core::{
         ResultAck, ResultHeader, RunningJob,
     },
     program::{Access, Content, JobProgram, Slicing},
+    project::Quota,
     time::Instant,
 };
 use mi_kernel::{NullModel, Reference, ShuffleKind, saved};
@@ -424,6 +425,7 @@ fn status() -> FarmStatus {
     let app = AppStatus {
         app: AppId(7),
         name: "render".to_owned(),
+        project: "films".to_owned(),
         weight: 1.0,
         connected: true,
         waiting_jobs: 1,
@@ -431,10 +433,21 @@ fn status() -> FarmStatus {
         delivered_jobs: 3,
         device_time_ns: 4,
     };
+    let project = ProjectStatus {
+        project: "films".to_owned(),
+        quota: Quota { devices: Some(4), weight: Some(2.0), ..Quota::default() },
+        apps: 1,
+        devices: 1,
+        queued_jobs: 2,
+        waiting_jobs: 1,
+        bytes: 5 << 20,
+        weight: 1.0,
+    };
     FarmStatus {
         epoch: Epoch(3),
         nodes: vec![node],
         apps: vec![app],
+        projects: vec![project],
         delivered_jobs: 3,
         replanned_jobs: 1,
         stolen_jobs: 1,

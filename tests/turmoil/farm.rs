@@ -300,7 +300,7 @@ impl World {
         loop {
             // An answer that was lost leaves a member behind: the next try is for another name.
             let name = Some(format!("{host}-{}", tries.next().unwrap_or(0)));
-            let invitation = Invitation { role, name, lifetime, uses: 1 };
+            let invitation = Invitation { role, name, lifetime, uses: 1, project: None };
             let joined = async {
                 let (_, token) =
                     control::create_token(COORDINATOR_ADDRESS, Some(operator), &invitation).await?;

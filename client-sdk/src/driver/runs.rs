@@ -43,6 +43,16 @@ struct Waiting {
     since: Instant,
 }
 
+impl Waiting {
+    /// What the application's own project has in use it will have done with: that is no reason to give up.
+    const fn tires(&self) -> bool {
+        match self.reason {
+            WaitReason::NoNode | WaitReason::NoFittingDevice => true,
+            WaitReason::OverQuota => false,
+        }
+    }
+}
+
 /// Nodes were named, and none lets us in.
 struct OutOfReach {
     since: Instant,
@@ -159,7 +169,7 @@ impl Runs {
     }
 
     pub(super) fn next_wake(&self) -> Option<Instant> {
-        let waits = self.waits.values().map(|wait| wait.since);
+        let waits = self.waits.values().filter(|wait| wait.tires()).map(|wait| wait.since);
         let since = waits.chain(self.out_of_reach.as_ref().map(|out| out.since));
         since.filter_map(|since| since.checked_add(self.patience)).min()
     }
@@ -170,7 +180,7 @@ impl Runs {
         let mut tired = Vec::new();
         self.waits.retain(|_, wait| {
             let waited = now.saturating_duration_since(wait.since);
-            let waits_on = waited < patience;
+            let waits_on = waited < patience || !wait.tires();
             if !waits_on {
                 tired.push((wait.task, wait.reason, waited));
             }

@@ -3,9 +3,10 @@
 use std::fmt::{self, Display, Write as _};
 
 use farm_core::{
-    coordinator::{FarmStatus, NodeState},
+    coordinator::{FarmStatus, NodeState, ProjectStatus},
     device::DeviceKind,
     message::CacheFigures,
+    project::Quota,
 };
 
 /// One page of metrics.
@@ -92,7 +93,56 @@ pub(super) fn render(status: &FarmStatus) -> String {
         let labels: [Label<'_>; 2] = [("app", &app.app.0), ("name", &app.name)];
         page.sample("gleaner_app_device_time_seconds_total", &labels, Seconds(app.device_time_ns));
     }
+    projects(&mut page, status);
     page.0
+}
+
+/// What projects have, and their bounds, of those that have one.
+fn projects(page: &mut Page, status: &FarmStatus) {
+    type Figure = fn(&ProjectStatus) -> f64;
+    type Most = fn(&Quota) -> Option<f64>;
+    let families: [(&str, &str, &str, Figure, Most); 4] = [
+        (
+            "gleaner_project_devices",
+            "gleaner_project_devices_quota",
+            "Devices that each project's jobs are on.",
+            |project| project.devices as f64,
+            |quota| quota.devices.map(f64::from),
+        ),
+        (
+            "gleaner_project_queued_jobs",
+            "gleaner_project_queued_jobs_quota",
+            "Jobs of each project that are planned and not delivered.",
+            |project| project.queued_jobs as f64,
+            |quota| quota.queued_jobs.map(|most| most as f64),
+        ),
+        (
+            "gleaner_project_bytes",
+            "gleaner_project_bytes_quota",
+            "Bytes of task data and modules of each project's planned jobs.",
+            |project| project.bytes as f64,
+            |quota| quota.bytes.map(|most| most as f64),
+        ),
+        (
+            "gleaner_project_weight",
+            "gleaner_project_weight_quota",
+            "What the fair-share weights of each project's applications come to.",
+            |project| project.weight,
+            |quota| quota.weight,
+        ),
+    ];
+    for (name, name_of_most, help, figure, most) in families {
+        page.family(name, "gauge", help);
+        for project in &status.projects {
+            page.sample(name, &[("project", &project.project)], figure(project));
+        }
+        page.family(name_of_most, "gauge", "What they may come to.");
+        for project in &status.projects {
+            if let Some(most) = most(&project.quota) {
+                page.sample(name_of_most, &[("project", &project.project)], most);
+            }
+        }
+    }
 }
 
 /// How a kind of storage is named, and what it shows of a node's cache.

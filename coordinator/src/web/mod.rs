@@ -96,10 +96,11 @@ pub(crate) mod samples {
     //! A farm to render.
 
     use farm_core::{
-        coordinator::{AppStatus, DeviceStatus, FarmStatus, NodeState, NodeStatus},
+        coordinator::{AppStatus, DeviceStatus, FarmStatus, NodeState, NodeStatus, ProjectStatus},
         device::DeviceKind,
         id::{AppId, DeviceIndex, Epoch, NodeId},
         message::CacheFigures,
+        project::Quota,
     };
 
     pub(crate) fn farm() -> FarmStatus {
@@ -126,6 +127,7 @@ pub(crate) mod samples {
         let app = AppStatus {
             app: AppId(9),
             name: "render".to_owned(),
+            project: "films".to_owned(),
             weight: 2.0,
             connected: true,
             waiting_jobs: 1,
@@ -133,10 +135,21 @@ pub(crate) mod samples {
             delivered_jobs: 3,
             device_time_ns: 4_000_000,
         };
+        let project = ProjectStatus {
+            project: "films".to_owned(),
+            quota: Quota { devices: Some(4), ..Quota::default() },
+            apps: 1,
+            devices: 3,
+            queued_jobs: 2,
+            waiting_jobs: 1,
+            bytes: 5_000,
+            weight: 2.0,
+        };
         FarmStatus {
             epoch: Epoch(5),
             nodes: vec![node],
             apps: vec![app],
+            projects: vec![project],
             delivered_jobs: 40,
             replanned_jobs: 6,
             stolen_jobs: 7,

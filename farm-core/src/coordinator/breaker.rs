@@ -91,6 +91,7 @@ impl CoordinatorMachine {
             | JobFailure::ContentUnavailable(_)
             | JobFailure::Poison(_)
             | JobFailure::PoisonApplication(_)
+            | JobFailure::OverQuota(_)
             | JobFailure::Cancelled
             | JobFailure::Returned => return,
         }

@@ -94,8 +94,11 @@ impl CoordinatorMachine {
             let device = &question.devices[position as usize];
             self.still_takes(now, &pending, device.node, device.device)
         });
+        let devices = chosen.iter().map(|&position| &question.devices[position as usize]);
+        let devices = devices.map(|device| (device.node, device.device)).collect();
+        let within = self.is_within_quota(pending.app, choices.len(), &devices);
         let Some(app) = self.apps.get(&pending.app) else { return };
-        if !stands || app.link.is_none() {
+        if !stands || !within || app.link.is_none() {
             self.fresh.push_back(pending);
             return;
         }

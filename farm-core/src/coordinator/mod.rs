@@ -7,7 +7,7 @@
 //! holds a learning policy's jobs back, `neighbours` says what they will cost), `inventory` (what nodes hold),
 //! `report` (what ended), `replan` (what was lost), `steal` (what moves between nodes), `speculate` (what runs twice at the tail),
 //! `breaker` (which application is stopped), `lease` (who is silent), `contents` (who has and brings which data), `durable` (what
-//! outlives it), `status` (what operators see), `timeline` (what ran when and where). `model` holds the state they share, `rates`
+//! outlives it), `project` (what belongs together, and may have how much), `status` (what operators see), `timeline` (what ran when and where). `model` holds the state they share, `rates`
 //! what devices are worth.
 
 mod breaker;
@@ -21,6 +21,7 @@ mod model;
 mod neighbours;
 mod placement;
 pub mod policy;
+mod project;
 mod rates;
 mod recovery;
 mod registry;
@@ -42,6 +43,7 @@ use self::{
     durable::{Durable, Keep, Restored},
     model::{App, Node, Peer, Pending, Placement},
     policy::{Choice, History, Question, QuestionId},
+    project::Projects,
     rates::Modules,
     recovery::Recovery,
     steal::{Steal, StealLatency},
@@ -54,6 +56,7 @@ use crate::{
         AppToCoordinator, CacheFigures, CoordinatorToApp, CoordinatorToNode, Liveness, NodeToCoordinator,
     },
     program::Content,
+    project::Quota,
     time::Instant,
 };
 
@@ -74,6 +77,8 @@ pub struct CoordinatorConfig {
     pub seed: u64,
     /// What earlier lives kept.
     pub restored: Restored,
+    /// What projects may have, by name.
+    pub quotas: BTreeMap<String, Quota>,
 }
 
 impl CoordinatorConfig {
@@ -88,6 +93,7 @@ impl CoordinatorConfig {
             plugins: BTreeSet::new(),
             seed,
             restored: Restored::default(),
+            quotas: BTreeMap::new(),
         }
     }
 }
@@ -113,6 +119,25 @@ pub enum Event {
     LinkClosed {
         /// Which.
         link: LinkId,
+    },
+    /// Whose the connection is on which an application says hello next; without, it is of the project `default`.
+    AppIntroduced {
+        /// Which.
+        link: LinkId,
+        /// The project's name.
+        project: String,
+    },
+    /// What a project may have from now on; one that is not there is made.
+    QuotaSet {
+        /// Its name.
+        project: String,
+        /// What it may have.
+        quota: Quota,
+    },
+    /// A project is none any more; what is registered of it goes on without quotas. `default` stays.
+    ProjectRemoved {
+        /// Its name.
+        project: String,
     },
     /// An operator asks a node to leave.
     DrainRequested {
@@ -247,7 +272,9 @@ pub struct AppStatus {
     pub app: AppId,
     /// For people.
     pub name: String,
-    /// Fair-share weight.
+    /// Its project.
+    pub project: String,
+    /// Fair-share weight that counts: what it asked for, or what its project's quota leaves of that.
     pub weight: f64,
     /// Whether its connection stands.
     pub connected: bool,
@@ -259,6 +286,27 @@ pub struct AppStatus {
     pub delivered_jobs: u64,
     /// Device time received, nanoseconds.
     pub device_time_ns: u64,
+}
+
+/// A project in [`FarmStatus`].
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct ProjectStatus {
+    /// Its name.
+    pub project: String,
+    /// What it may have.
+    pub quota: Quota,
+    /// Its registered applications.
+    pub apps: u64,
+    /// Devices that its jobs are on.
+    pub devices: u64,
+    /// Its jobs that are planned and not delivered.
+    pub queued_jobs: u64,
+    /// Its jobs that wait at the coordinator.
+    pub waiting_jobs: u64,
+    /// Bytes of contents that count for it.
+    pub bytes: u64,
+    /// What its applications' weights come to.
+    pub weight: f64,
 }
 
 /// Where a job is, as far as a coordinator knows.
@@ -286,6 +334,8 @@ pub struct FarmStatus {
     pub nodes: Vec<NodeStatus>,
     /// Applications by id.
     pub apps: Vec<AppStatus>,
+    /// Projects by name.
+    pub projects: Vec<ProjectStatus>,
     /// Jobs delivered since this start.
     pub delivered_jobs: u64,
     /// New attempts after a loss since this start.
@@ -317,6 +367,9 @@ pub struct CoordinatorMachine {
     fresh: VecDeque<Pending>,
     /// Jobs that no device can take now, first come, first served; tried again when that may have changed.
     stuck: VecDeque<Pending>,
+    projects: Projects,
+    /// Jobs whose projects have as much as they may, first come, first served; tried again when one has less.
+    over_quota: VecDeque<Pending>,
     /// Jobs that are held back until those before them have nearly ended: of the policy `neighbours`.
     reserved: BTreeMap<(AppId, BatchId), Pending>,
     /// Batches that a plug-in was asked about.
@@ -352,8 +405,9 @@ pub struct CoordinatorMachine {
 impl CoordinatorMachine {
     /// A coordinator that knows nobody yet.
     #[must_use]
-    pub fn new(config: CoordinatorConfig) -> Self {
+    pub fn new(mut config: CoordinatorConfig) -> Self {
         Self {
+            projects: Projects::new(std::mem::take(&mut config.quotas)),
             config,
             links: BTreeMap::new(),
             apps: BTreeMap::new(),
@@ -366,6 +420,7 @@ impl CoordinatorMachine {
             history: History::default(),
             fresh: VecDeque::new(),
             stuck: VecDeque::new(),
+            over_quota: VecDeque::new(),
             reserved: BTreeMap::new(),
             questions: BTreeMap::new(),
             next_question: 1,
@@ -405,6 +460,18 @@ impl CoordinatorMachine {
             }
             Event::LinkClosed { link } => {
                 self.link_closed(now, link);
+                None
+            }
+            Event::AppIntroduced { link, project } => {
+                self.projects.introduce(link, project);
+                None
+            }
+            Event::QuotaSet { project, quota } => {
+                self.set_quota(&project, quota);
+                None
+            }
+            Event::ProjectRemoved { project } => {
+                self.remove_project(&project);
                 None
             }
             Event::EvictRequested { node, contents } => {

@@ -42,7 +42,6 @@ pub(super) enum Peer {
 #[derive(Debug)]
 pub(super) struct App {
     pub(super) name: String,
-    pub(super) weight: f64,
     /// Its queued jobs may be moved to balance nodes.
     pub(super) global_stealing: bool,
     pub(super) policy: Policy,
@@ -89,6 +88,8 @@ pub(super) struct Batch {
     pub(super) module: Module,
     /// What a node needs to have before it can run them.
     pub(super) contents: Vec<Content>,
+    /// They count for its project: some of its jobs had a place.
+    pub(super) counted: bool,
     /// Its jobs in [`App::jobs`].
     pub(super) open_jobs: u32,
     /// Those of them that have a place and are not executed.
@@ -120,7 +121,7 @@ pub(super) struct Job {
 /// Where a job is, as far as the coordinator knows.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum JobState {
-    /// In `fresh`, `stuck`, `lost` or `reserved`.
+    /// In `fresh`, `stuck`, `over_quota`, `lost` or `reserved`.
     Waiting,
     /// Planned; in transit, queued or running.
     Placed(Placement),

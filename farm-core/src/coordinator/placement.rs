@@ -80,7 +80,9 @@ impl CoordinatorMachine {
         for ((app, batch), keys) in std::mem::take(&mut self.lost).into_iter().rev() {
             self.fresh.push_front(Pending { app, batch, answers: None, keys });
         }
-        while let Some(pending) = self.fresh.pop_front() {
+        loop {
+            self.retry_relieved();
+            let Some(pending) = self.fresh.pop_front() else { return };
             self.place_batch(now, pending);
         }
     }
@@ -95,13 +97,14 @@ impl CoordinatorMachine {
     pub(super) fn forget_pending(&mut self, gone: impl Fn(&Pending) -> bool) {
         self.fresh.retain(|pending| !gone(pending));
         self.stuck.retain(|pending| !gone(pending));
+        self.over_quota.retain(|pending| !gone(pending));
         self.reserved.retain(|_, pending| !gone(pending));
         self.questions.retain(|_, asked| !gone(&asked.pending));
     }
 
     /// Takes the jobs of a task out of line.
     pub(super) fn forget_waiting(&mut self, id: AppId, task: TaskId) {
-        for queue in [&mut self.fresh, &mut self.stuck] {
+        for queue in [&mut self.fresh, &mut self.stuck, &mut self.over_quota] {
             for pending in queue.iter_mut().filter(|pending| pending.app == id) {
                 pending.keys.retain(|key| key.task != task);
             }
@@ -180,7 +183,7 @@ impl CoordinatorMachine {
         }
     }
 
-    /// What is to be decided for a batch. `None` if nothing is: its jobs are gone, or wait in `stuck` for a device.
+    /// What is to be decided for a batch. `None` if nothing is: its jobs are gone, or wait in `stuck` or `over_quota`.
     fn question(&mut self, now: Instant, mut pending: Pending) -> Option<(Pending, Question)> {
         let app = self.apps.get(&pending.app)?;
         let batch = app.batches.get(&pending.batch)?;
@@ -194,17 +197,19 @@ impl CoordinatorMachine {
         if devices.is_empty() {
             pending.keys =
                 jobs.into_iter().map(|job| JobKey { task: batch.task, index: job.index }).collect();
-            self.say_waiting(pending.app, pending.batch);
+            self.say_waiting(pending.app, pending.batch, self.why_stuck());
             self.stuck.push_back(pending);
             return None;
         }
         let question = Question { app: pending.app, task: batch.task, jobs, devices };
+        let question = self.within_quota(&mut pending, question)?;
         Some((pending, question))
     }
 
     /// Gives the jobs of a batch their places, and tells the application.
     pub(super) fn enter(&mut self, now: Instant, pending: &Pending, question: &Question, choices: &[Choice]) {
         let shares = self.issue_attempts(now, pending, question, choices);
+        self.count_contents(pending);
         let nodes = self.enter_plan(now, pending, shares);
         if pending.answers.is_none() {
             self.replanned_jobs += choices.len() as u64;
@@ -268,6 +273,7 @@ impl CoordinatorMachine {
             batch.placed_jobs += 1;
             share.jobs.push(JobAttempt { job: key.in_app(pending.app), attempt });
             share.loads.push(load);
+            self.projects.occupies(pending.app, (share.node, share.device));
             job.state = JobState::Placed(Placement {
                 node: share.node,
                 device: share.device,
@@ -322,13 +328,17 @@ impl CoordinatorMachine {
         Some(NodePlan { node: id, session: node.session, contact: node.contact.clone(), devices })
     }
 
-    fn say_waiting(&mut self, id: AppId, batch: BatchId) {
+    /// Why jobs without any device for them wait.
+    fn why_stuck(&self) -> WaitReason {
         // One that leaves is as good as gone.
         let stays = |node: &Node| node.state != NodeState::Draining;
-        let reason = match self.nodes.values().any(stays) {
+        match self.nodes.values().any(stays) {
             true => WaitReason::NoFittingDevice,
             false => WaitReason::NoNode,
-        };
+        }
+    }
+
+    pub(super) fn say_waiting(&mut self, id: AppId, batch: BatchId, reason: WaitReason) {
         let Some(app) = self.apps.get_mut(&id).filter(|app| app.link.is_some() && !app.deaf) else {
             return;
         };
@@ -344,7 +354,7 @@ impl CoordinatorMachine {
         if !self.apps.get(&id).is_some_and(|app| app.batches.contains_key(&batch)) {
             return keys;
         }
-        for queue in [&mut self.fresh, &mut self.stuck] {
+        for queue in [&mut self.fresh, &mut self.stuck, &mut self.over_quota] {
             queue.retain_mut(|pending| {
                 let asked = pending.app == id && pending.batch == batch;
                 if asked {
@@ -422,6 +432,7 @@ fn take_in(app: &mut App, request: &PlanRequest, module: Module) -> Intake {
             module,
             contents: request.contents.clone(),
             open_jobs: 0,
+            counted: false,
             told: None,
             placed_jobs: 0,
             samples: Samples::default(),

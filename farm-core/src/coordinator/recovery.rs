@@ -207,6 +207,7 @@ impl CoordinatorMachine {
                 if let Some(device) = node.device_mut(device) {
                     device.add_load(now, load);
                 }
+                self.projects.occupies(id, (node_id, device));
                 JobState::Placed(Placement {
                     node: node_id,
                     device,
@@ -219,6 +220,9 @@ impl CoordinatorMachine {
             };
             touched.insert(node_id);
             adopted.push((key, state));
+        }
+        if !adopted.is_empty() {
+            self.count_contents(&pending);
         }
         let Some(app) = self.apps.get_mut(&id) else { return rest };
         let contents = app.batches.get_mut(&batch).map_or_else(Vec::new, |batch| {

@@ -38,13 +38,16 @@ const EPOCH_SHIFT: u32 = 32;
 
 impl CoordinatorMachine {
     pub(super) fn app_hello(&mut self, now: Instant, link: LinkId, hello: AppHello) {
-        match self.admit_app(&hello) {
+        let project = self.projects.introduced(link);
+        match self.admit_app(&hello, &project) {
             Err(reason) => {
                 self.effects.push_back(Effect::ToApp { link, message: CoordinatorToApp::Refused { reason } });
                 self.effects.push_back(Effect::Close { link });
             }
             Ok(Admission::Back(app)) => self.app_comes_back(now, link, app),
-            Ok(Admission::New(app, incarnation)) => self.app_joins(now, link, app, incarnation, hello),
+            Ok(Admission::New(app, incarnation)) => {
+                self.app_joins(now, link, (app, incarnation), hello, &project);
+            }
         }
     }
 
@@ -85,9 +88,8 @@ impl CoordinatorMachine {
             id,
             CoordinatorToNode::Welcome { node: id, epoch: self.config.epoch, liveness: self.config.liveness },
         );
-        let apps: Vec<(AppId, f64)> = self.apps.iter().map(|(&app, known)| (app, known.weight)).collect();
-        for (app, weight) in apps {
-            self.tell_node(id, CoordinatorToNode::AppJoined { app, weight });
+        for app in self.apps.keys().copied().collect::<Vec<_>>() {
+            self.tell_node(id, CoordinatorToNode::AppJoined { app, terms: self.terms_of(app) });
         }
         if draining {
             self.tell_node(id, CoordinatorToNode::Drain);
@@ -132,6 +134,10 @@ impl CoordinatorMachine {
         for (key, job) in app.jobs {
             self.release(id, key, job.state);
         }
+        for batch in app.batches.into_values().filter(|batch| batch.counted) {
+            self.projects.counts_no_more(id, &batch.contents);
+        }
+        self.app_leaves_project(id);
         self.forget_pending(|pending| pending.app == id);
         let nodes: Vec<NodeId> = self.nodes.keys().copied().collect();
         for node in nodes {
@@ -152,7 +158,7 @@ impl CoordinatorMachine {
         self.tell_node(id, CoordinatorToNode::Drain);
     }
 
-    fn admit_app(&self, hello: &AppHello) -> Result<Admission, String> {
+    fn admit_app(&self, hello: &AppHello, project: &str) -> Result<Admission, String> {
         check_protocol(hello.protocol)?;
         check_name(&hello.name)?;
         let policy = Policy::named(&hello.policy);
@@ -170,6 +176,10 @@ impl CoordinatorMachine {
             return Err(format!("weight {} must be positive and finite", hello.weight));
         }
         if let Some((app, incarnation)) = hello.resume {
+            if self.apps.contains_key(&app) && self.projects.name_of(app) != project {
+                let own = self.projects.name_of(app);
+                return Err(format!("{app} is of the project {own}, and you are of the project {project}"));
+            }
             return match self.apps.get(&app) {
                 Some(known) if known.incarnation == incarnation => Ok(Admission::Back(app)),
                 // The welcome that told it of its new incarnation got lost.
@@ -217,16 +227,15 @@ impl CoordinatorMachine {
         &mut self,
         now: Instant,
         link: LinkId,
-        id: AppId,
-        incarnation: AppIncarnation,
+        (id, incarnation): (AppId, AppIncarnation),
         hello: AppHello,
+        project: &str,
     ) {
         if hello.resume.is_none() {
             self.next_app += 1;
         }
         let app = App {
             name: hello.name,
-            weight: hello.weight,
             global_stealing: hello.global_stealing,
             policy: Policy::named(&hello.policy),
             incarnation,
@@ -249,10 +258,7 @@ impl CoordinatorMachine {
         self.apps.insert(id, app);
         self.links.insert(link, Peer::App(id));
         self.welcome_app(now, id);
-        let nodes: Vec<NodeId> = self.nodes.keys().copied().collect();
-        for node in nodes {
-            self.tell_node(node, CoordinatorToNode::AppJoined { app: id, weight: hello.weight });
-        }
+        self.app_enters_project(id, project, hello.weight);
     }
 
     /// The connection was broken and stands again: repeats everything that may have been lost with the old one.

@@ -229,6 +229,10 @@ impl CoordinatorMachine {
     /// Takes what a job occupies off the books of its node.
     pub(super) fn release(&mut self, app: AppId, key: JobKey, state: JobState) {
         let Some((id, _)) = state.holder() else { return };
+        self.projects.relieve(app);
+        if let JobState::Placed(place) = state {
+            self.projects.vacates(app, (place.node, place.device));
+        }
         // A node that is gone took its books along.
         let Some(node) = self.nodes.get_mut(&id) else { return };
         node.jobs.remove(&key.in_app(app));
@@ -254,7 +258,10 @@ impl CoordinatorMachine {
         if let Some(batch) = app.batches.get_mut(&job.batch) {
             batch.open_jobs -= 1;
             if batch.open_jobs == 0 {
-                app.batches.remove(&job.batch);
+                let over = app.batches.remove(&job.batch);
+                if let Some(over) = over.filter(|over| over.counted) {
+                    self.projects.counts_no_more(id.app, &over.contents);
+                }
                 let batch = job.batch;
                 self.forget_pending(|pending| pending.app == id.app && pending.batch == batch);
             }
@@ -293,7 +300,7 @@ impl CoordinatorMachine {
         self.apps.get(&id.app)?.jobs.get(&JobKey::of(id))
     }
 
-    fn fail_job(&mut self, id: JobId, failure: JobFailure) {
+    pub(super) fn fail_job(&mut self, id: JobId, failure: JobFailure) {
         self.forget_job(id);
         let key = JobKey::of(id);
         let Some(app) = self.apps.get_mut(&id.app) else { return };

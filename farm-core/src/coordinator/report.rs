@@ -68,6 +68,8 @@ impl CoordinatorMachine {
         let Some(sibling) = node.sibling_of(now, lost, &self.modules) else { return };
         place.device = sibling;
         let load = place.load;
+        self.projects.vacates(job.app, (id, lost));
+        self.projects.occupies(job.app, (id, sibling));
         if let Some(device) = node.device_mut(lost) {
             device.drop_load(load);
         }
@@ -155,6 +157,7 @@ impl CoordinatorMachine {
         let JobState::Placed(place) = record.state else { return None };
         record.state = JobState::Executed { node: id, device: place.device, attempt: job.attempt };
         let batch = record.batch;
+        self.projects.vacates(job.job.app, (id, place.device));
         let device = self.nodes.get_mut(&id)?.device_mut(place.device)?;
         device.drop_load(place.load);
         let planned_jobs = device.planned_jobs;

@@ -98,7 +98,9 @@ impl CoordinatorMachine {
             let Some(job) = app.jobs.get(&JobKey::of(id)) else { continue };
             let fits =
                 app.batches.get(&job.batch).is_some_and(|batch| batch.needs.fulfilled_by(&device.info));
-            let reachable = app.link.is_some() && app.can_reach(now, helper);
+            let reachable = app.link.is_some()
+                && app.can_reach(now, helper)
+                && self.projects.may_use(id.app, (helper, index));
             // What crashed once may be poison: one device at a time.
             let harmless = job.crashes == 0 && job.avoid != Some(helper);
             if !(app.global_stealing && fits && reachable && harmless) {
@@ -154,6 +156,7 @@ impl CoordinatorMachine {
         if let Some(device) = node.device_mut(device) {
             device.add_load(now, place.load);
         }
+        self.projects.occupies(id.app, (helper, device));
         self.backups.insert(id, place);
         self.speculations += 1;
         tracing::info!(job = %id, from = %straggler.place.node, to = %helper, "second attempt at the tail");

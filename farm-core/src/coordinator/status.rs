@@ -11,6 +11,7 @@ impl CoordinatorMachine {
             epoch: self.config.epoch,
             nodes: self.node_statuses(),
             apps: self.app_statuses(),
+            projects: self.project_statuses(),
             delivered_jobs: self.delivered_jobs,
             replanned_jobs: self.replanned_jobs,
             stolen_jobs: self.stolen_jobs,
@@ -71,7 +72,8 @@ impl CoordinatorMachine {
             .map(|(&id, app)| AppStatus {
                 app: id,
                 name: app.name.clone(),
-                weight: app.weight,
+                project: self.projects.name_of(id).to_owned(),
+                weight: self.terms_of(id).weight,
                 connected: app.link.is_some(),
                 waiting_jobs: app.waiting_jobs,
                 outstanding_jobs: app.jobs.len() as u64 - app.waiting_jobs,

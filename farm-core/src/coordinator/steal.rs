@@ -367,7 +367,24 @@ impl CoordinatorMachine {
             && rested
             && job.stolen_from.len() < MAX_STEALS
             && !job.stolen_from.contains(&thief.node)
-            && fitting(app, job, to, thief.kind).next().is_some()
+            && self.fitting(id.app, (app, job), (thief.node, to), thief.kind).next().is_some()
+    }
+
+    /// The devices of a kind that fulfil a job's needs, and that its project may be on.
+    fn fitting<'farm>(
+        &'farm self,
+        id: AppId,
+        (app, job): (&App, &Job),
+        (node, to): (NodeId, &'farm Node),
+        kind: DeviceKind,
+    ) -> impl Iterator<Item = (DeviceIndex, &'farm Device)> + use<'farm> {
+        let needs = app.batches.get(&job.batch).map(|batch| batch.needs);
+        (0_u16..).map(DeviceIndex).zip(&to.devices).filter(move |(index, device)| {
+            !device.lost
+                && device.info.kind == kind
+                && needs.is_some_and(|needs| needs.fulfilled_by(&device.info))
+                && self.projects.may_use(id, (node, *index))
+        })
     }
 
     fn order(
@@ -410,9 +427,11 @@ impl CoordinatorMachine {
             let job_ns = from.load.amount as f64 / device.throughput.rate(&self.modules, from.load.module);
             device.free_at_ns(now, &self.modules) + job_ns
         };
-        let earliest = fitting(app, job, thief, steal.kind)
+        let earliest = self
+            .fitting(id.app, (app, job), (steal.thief, thief), steal.kind)
             .min_by(|(_, one), (_, other)| free_at(one).total_cmp(&free_at(other)));
         let Some((device, _)) = earliest else { return false };
+        self.projects.occupies(id.app, (steal.thief, device));
         self.release(id.app, JobKey::of(id), JobState::Placed(from));
         let attempt = Attempt { epoch: self.config.epoch, sequence: self.next_attempt };
         self.next_attempt += 1;
@@ -498,17 +517,3 @@ fn reaches(app: &App, now: Instant, node: NodeId) -> bool {
     app.link.is_some() && app.can_reach(now, node)
 }
 
-/// The devices of a kind that fulfil a job's needs.
-fn fitting<'node>(
-    app: &App,
-    job: &Job,
-    node: &'node Node,
-    kind: DeviceKind,
-) -> impl Iterator<Item = (DeviceIndex, &'node Device)> + use<'node> {
-    let needs = app.batches.get(&job.batch).map(|batch| batch.needs);
-    (0_u16..).map(DeviceIndex).zip(&node.devices).filter(move |(_, device)| {
-        !device.lost
-            && device.info.kind == kind
-            && needs.is_some_and(|needs| needs.fulfilled_by(&device.info))
-    })
-}

@@ -1,11 +1,15 @@
 //! Applications as a node knows them: who they are, their one current link, when they are gone.
 
-use std::time::Duration;
+use std::{
+    collections::{BTreeMap, BTreeSet},
+    time::Duration,
+};
 
 use super::{Effect, WorkerMachine};
 use crate::{
     id::{AppId, AppIncarnation, JobAttempt, LinkId},
     message::{AppToNode, JobTicket, NodeToApp, PROTOCOL_VERSION},
+    project::AppTerms,
     time::Instant,
 };
 
@@ -37,13 +41,27 @@ pub(super) struct App {
     pub(super) spool_bytes: u64,
     /// It has a share of the devices now.
     pub(super) awake: bool,
+    /// Its project, once the coordinator said which.
+    project: String,
+    /// Its jobs are not taken by other devices than those that they were planned for.
+    pub(super) stays: bool,
 }
 
 impl App {
-    /// Whether it leaves no more results behind than it may.
-    pub(super) const fn takes_results(&self, quota_bytes: u64) -> bool {
-        self.spool_bytes < quota_bytes
+    /// Whether it gets a further job: it leaves no more results behind than it may, and neither does its project.
+    pub(super) fn takes_results(&self, quota_bytes: u64, projects: &BTreeMap<String, Project>) -> bool {
+        let fits = |project: &Project| project.quota_bytes.is_none_or(|quota| project.spool_bytes < quota);
+        self.spool_bytes < quota_bytes && projects.get(&self.project).is_none_or(fits)
     }
+}
+
+/// Results of the applications of one project.
+#[derive(Debug, Default)]
+pub(super) struct Project {
+    apps: BTreeSet<AppId>,
+    spool_bytes: u64,
+    /// What they may come to before the applications get no further job.
+    quota_bytes: Option<u64>,
 }
 
 impl WorkerMachine {
@@ -106,11 +124,56 @@ impl WorkerMachine {
         self.link_fetches_nothing(now, link);
     }
 
-    pub(super) fn app_joined(&mut self, id: AppId, weight: f64) {
+    pub(super) fn app_joined(&mut self, id: AppId, terms: AppTerms) {
+        let AppTerms { weight, project, result_bytes, stays } = terms;
+        self.leave_project(id);
         let app = self.apps.entry(id).or_default();
         app.announced = true;
         app.drop_at = None;
+        app.project.clone_from(&project);
+        app.stays = stays;
+        let entered = self.projects.entry(project).or_default();
+        entered.apps.insert(id);
+        entered.spool_bytes += app.spool_bytes;
+        entered.quota_bytes = result_bytes;
         self.lags.join(id, weight);
+        self.settle_shares_with(id);
+    }
+
+    pub(super) fn takes_results(&self, id: AppId) -> bool {
+        let app = self.apps.get(&id);
+        app.is_some_and(|app| app.takes_results(self.spool_quota_bytes(), &self.projects))
+    }
+
+    /// What an application that may be gone meant to its project.
+    fn leave_project(&mut self, id: AppId) {
+        let Some(app) = self.apps.get(&id) else { return };
+        let Some(project) = self.projects.get_mut(&app.project) else { return };
+        if project.apps.remove(&id) {
+            project.spool_bytes -= app.spool_bytes;
+        }
+        if project.apps.is_empty() {
+            self.projects.remove(&app.project);
+        }
+    }
+
+    /// I8: a project's results are those of its applications.
+    pub(super) fn check_projects(&self) {
+        for (name, project) in &self.projects {
+            assert!(!project.apps.is_empty(), "I8: project {name} has no application");
+            let of_app = |app: &AppId| self.apps.get(app).map(|app| app.spool_bytes);
+            let spooled: Option<u64> = project.apps.iter().map(of_app).sum();
+            assert_eq!(spooled, Some(project.spool_bytes), "I8: the results of project {name}");
+        }
+    }
+
+    /// An application's project may have reached its quota, or left it behind.
+    fn settle_shares_with(&mut self, id: AppId) {
+        let project = self.apps.get(&id).and_then(|app| self.projects.get(&app.project));
+        match project.filter(|project| project.quota_bytes.is_some()) {
+            Some(project) => project.apps.clone().into_iter().for_each(|app| self.settle_share(app)),
+            None => self.settle_share(id),
+        }
     }
 
     /// Everything of the application is dropped, whatever state it is in.
@@ -123,6 +186,7 @@ impl WorkerMachine {
             self.links.remove(&link);
             self.push(Effect::CloseApp { link });
         }
+        self.leave_project(id);
         if self.apps.remove(&id).is_some() {
             self.lags.leave(id);
         }
@@ -214,9 +278,9 @@ impl WorkerMachine {
 
     /// An application has a share while it has something to run and takes its results.
     pub(super) fn settle_share(&mut self, id: AppId) {
-        let quota_bytes = self.spool_quota_bytes();
+        let takes_results = self.takes_results(id);
         let Some(app) = self.apps.get_mut(&id) else { return };
-        let awake = app.active_jobs > 0 && app.takes_results(quota_bytes);
+        let awake = app.active_jobs > 0 && takes_results;
         match (std::mem::replace(&mut app.awake, awake), awake) {
             (false, true) => self.lags.wake(id),
             (true, false) => self.lags.rest(id),
@@ -229,7 +293,10 @@ impl WorkerMachine {
         self.spool_bytes = change(self.spool_bytes);
         if let Some(app) = self.apps.get_mut(&id) {
             app.spool_bytes = change(app.spool_bytes);
-            self.settle_share(id);
+            if let Some(project) = self.projects.get_mut(&app.project) {
+                project.spool_bytes = change(project.spool_bytes);
+            }
+            self.settle_shares_with(id);
         }
     }
 
@@ -243,6 +310,7 @@ impl WorkerMachine {
         let idle =
             self.apps.get(&id).is_some_and(|app| !app.announced && app.link.is_none() && app.held_jobs == 0);
         if idle {
+            self.leave_project(id);
             self.apps.remove(&id);
             self.lags.leave(id);
         }

@@ -10,7 +10,7 @@ use super::{
     report::Reports,
 };
 use crate::{
-    id::{AppId, ContentHash, DeviceIndex},
+    id::{ContentHash, DeviceIndex},
     message::LatencyClass,
 };
 
@@ -25,6 +25,7 @@ impl WorkerMachine {
         }
         self.check_places();
         self.check_apps();
+        self.check_projects();
         self.check_contents();
         assert!(self.jobs.len() <= self.config.max_jobs, "I8: more than {} jobs", self.config.max_jobs);
         assert!(self.reports.kept() <= Reports::max_kept(), "I8: more reports are kept than allowed");
@@ -74,10 +75,7 @@ impl WorkerMachine {
                 "waiting jobs of {index}"
             );
             let idle = !device.lost && device.handed_over.is_empty();
-            let quota_bytes = self.spool_quota_bytes();
-            let takes_results =
-                |app: &AppId| self.apps.get(app).is_some_and(|app| app.takes_results(quota_bytes));
-            let waits = device.queues().keys().any(takes_results);
+            let waits = device.queues().keys().any(|app| self.takes_results(*app));
             assert!(!idle || !waits, "I6: {index} is idle while jobs are in its queue");
             assert!(
                 device.queues().values().all(|queue| !queue.is_empty()),
@@ -129,7 +127,7 @@ impl WorkerMachine {
             assert_eq!(active, app.active_jobs, "active jobs of {id}");
             let spooled = held.iter().map(|held| held.spooled_bytes()).sum::<u64>();
             assert_eq!(spooled, app.spool_bytes, "I8: the results of {id}");
-            let awake = active > 0 && app.takes_results(self.spool_quota_bytes());
+            let awake = active > 0 && self.takes_results(*id);
             assert_eq!(app.awake, awake, "whether {id} has a share");
         }
         let known = self.jobs.keys().all(|job| self.apps.contains_key(&job.app));

@@ -34,7 +34,7 @@ use rand::{SeedableRng, rngs::SmallRng};
 pub use self::share::Share;
 pub use self::standing::Standing;
 use self::{
-    app::App,
+    app::{App, Project},
     content::{Holding, large},
     device::Device,
     drain::Drain,
@@ -235,6 +235,8 @@ pub struct WorkerMachine {
     compare_at: Instant,
     drain: Drain,
     apps: BTreeMap<AppId, App>,
+    /// Projects of the announced ones, by name.
+    projects: BTreeMap<String, Project>,
     links: BTreeMap<LinkId, AppId>,
     /// One attempt of each job at most: a larger one replaces a smaller one.
     jobs: BTreeMap<JobId, HeldJob>,
@@ -278,6 +280,7 @@ impl WorkerMachine {
             compare_at: Instant::ZERO,
             drain: Drain::No,
             apps: BTreeMap::new(),
+            projects: BTreeMap::new(),
             links: BTreeMap::new(),
             jobs: BTreeMap::new(),
             tombstones: Tombstones::default(),

@@ -3,6 +3,7 @@
 
 use super::{
     Effect, WorkerMachine,
+    app::App,
     device::{Device, load_ns},
     job::{Handed, HeldState, Phase, Rank},
 };
@@ -46,7 +47,7 @@ impl WorkerMachine {
         }
         for index in self.device_indices() {
             if self.has_urgent_room(index)
-                && let Some((rank, LatencyClass::Interactive)) = self.draw(index)
+                && let Some((rank, LatencyClass::Interactive)) = self.draw(index, |_| true)
             {
                 self.hand_over(now, rank, index, index);
             }
@@ -87,23 +88,25 @@ impl WorkerMachine {
 
     /// Stages the next job of a device's own queue.
     fn hand_over_next(&mut self, now: Instant, index: DeviceIndex) -> bool {
-        let Some((rank, _)) = self.draw(index) else { return false };
+        let Some((rank, _)) = self.draw(index, |_| true) else { return false };
         self.hand_over(now, rank, index, index);
         true
     }
 
     /// The next job of a device's queue, and the class that it counts as. The draw is among the applications of the
     /// highest class; one that had too much counts as batch: its class says when it is served, never how much.
-    fn draw(&mut self, index: DeviceIndex) -> Option<(Rank, LatencyClass)> {
+    fn draw(&mut self, index: DeviceIndex, may: impl Fn(&App) -> bool) -> Option<(Rank, LatencyClass)> {
         let queues = self.devices[usize::from(index.0)].queues();
         let lags = &self.lags;
         let counts_as = |app: AppId, first: &Rank| {
             if lags.had_too_much(app) { LatencyClass::Batch } else { first.class.0 }
         };
-        let (apps, quota_bytes) = (&self.apps, self.spool_quota_bytes());
-        let takes_results = |app: &AppId| apps.get(app).is_some_and(|app| app.takes_results(quota_bytes));
+        let (apps, projects, quota_bytes) = (&self.apps, &self.projects, self.spool_quota_bytes());
+        let takes_part = |app: &AppId| {
+            apps.get(app).is_some_and(|app| app.takes_results(quota_bytes, projects) && may(app))
+        };
         let firsts = || {
-            let queues = queues.iter().filter(|(app, _)| takes_results(app));
+            let queues = queues.iter().filter(|(app, _)| takes_part(app));
             queues.filter_map(|(&app, queue)| Some((app, queue.first()?)))
         };
         let class = firsts().map(|(app, first)| counts_as(app, first)).max()?;
@@ -137,15 +140,19 @@ impl WorkerMachine {
         }
         let ends =
             |victim: &Device| self.remaining_ns(now, victim) + victim.queued_ns() as f64 / self.speed(victim);
+        let moves = |app: &App| !app.stays;
+        let has_loot = |victim: &Device| {
+            victim.queues().keys().filter_map(|app| self.apps.get(app)).any(moves) && own.stands_in_for(victim)
+        };
         let victims = (0_u16..)
             .map(DeviceIndex)
             .zip(&self.devices)
-            .filter(|(index, victim)| *index != thief && victim.queued_jobs > 0 && own.stands_in_for(victim));
+            .filter(|(index, victim)| *index != thief && victim.queued_jobs > 0 && has_loot(victim));
         let last = victims
             .map(|(index, victim)| (index, ends(victim)))
             .max_by(|(_, one), (_, other)| one.total_cmp(other));
         let Some((victim, end)) = last else { return };
-        let Some((first, _)) = self.draw(victim) else { return };
+        let Some((first, _)) = self.draw(victim, moves) else { return };
         let [own, owner] = [thief, victim].map(|index| &self.devices[usize::from(index.0)]);
         let (here, there) = (self.remaining_ns(now, own), self.remaining_ns(now, owner));
         let takes = |device, rank: &Rank| {
@@ -172,7 +179,8 @@ impl WorkerMachine {
             };
             let Some(held) = self.jobs.get(&id) else { continue };
             let staged = matches!(held.state, HeldState::HandedOver(handed) if handed.phase == Phase::Staged);
-            if !staged || !own.stands_in_for(victim) {
+            let stays = self.apps.get(&id.app).is_some_and(|app| app.stays);
+            if !staged || stays || !own.stands_in_for(victim) {
                 continue;
             }
             let there = self.remaining_ns(now, victim);

@@ -10,15 +10,16 @@ use farm_core::{
     },
     device::{DeviceInfo, DeviceKind, Features, Limits, Requirements},
     id::{
-        AppIncarnation, BatchId, ContentHash, DeviceIndex, Epoch, JobAttempt, JobIndex, LinkId, NodeSession,
+        AppId, AppIncarnation, BatchId, ContentHash, DeviceIndex, Epoch, JobAttempt, JobIndex, LinkId, NodeSession,
         TaskId,
     },
     message::{
         AppHello, AppToCoordinator, CacheFigures, Contact, CoordinatorToApp, CoordinatorToNode, CostNs,
         DeviceLoad, Executed, JobFailure, JobTrace, NodeHello, NodeToCoordinator, PROTOCOL_VERSION, Plan,
-        PlanJob, PlanRequest, RunningJob,
+        PlanJob, PlanRequest, RunningJob, WaitReason,
     },
     program::Content,
+    project::AppTerms,
     time::Instant,
 };
 
@@ -44,6 +45,12 @@ pub(crate) struct Farm {
     pub(crate) located: Vec<(u64, Option<String>)>,
     /// What is to outlive the coordinator, in order.
     pub(crate) kept: Vec<Keep>,
+    /// Why the application's batches wait, in the order that it was told.
+    pub(crate) waits: Vec<WaitReason>,
+    /// The jobs that were given up.
+    pub(crate) given_up: Vec<JobFailure>,
+    /// What node 1 was told last of what each application may have.
+    pub(crate) terms: BTreeMap<AppId, AppTerms>,
 }
 
 impl Farm {
@@ -65,6 +72,9 @@ impl Farm {
             asked: Vec::new(),
             located: Vec::new(),
             kept: Vec::new(),
+            waits: Vec::new(),
+            given_up: Vec::new(),
+            terms: BTreeMap::new(),
         };
         for (node, &score) in (1..).zip(scores) {
             farm.node_joins(node, score);
@@ -154,6 +164,15 @@ impl Farm {
                 }
                 Effect::ToNode { link, message: CoordinatorToNode::Cancel { jobs } } => {
                     self.cancelled.extend(jobs.into_iter().map(|job| (link.0, job)));
+                }
+                Effect::ToApp { message: CoordinatorToApp::Waiting { reason, .. }, .. } => {
+                    self.waits.push(reason);
+                }
+                Effect::ToApp { message: CoordinatorToApp::JobFailed { failure, .. }, .. } => {
+                    self.given_up.push(failure);
+                }
+                Effect::ToNode { link: LinkId(1), message: CoordinatorToNode::AppJoined { app, terms } } => {
+                    self.terms.insert(app, terms);
                 }
                 Effect::ToNode { link, message: CoordinatorToNode::SayInventory } => self.asked.push(link.0),
                 Effect::ToNode { link, message: CoordinatorToNode::Located { peer, .. } } => {
@@ -317,8 +336,13 @@ impl Farm {
     }
 
     /// A node has executed and delivered a job just now, in so many milliseconds.
-    pub(crate) fn ended(&mut self, node: u64, job: JobAttempt, took_ms: u64) {
-        self.report(node, DeviceIndex(0), job, took_ms * MILLISECOND_NS, None);
+    pub(crate) fn ended(
+        &mut self,
+        node: u64,
+        job: JobAttempt,
+        took_ms: u64,
+    ) -> BTreeMap<u64, Vec<JobAttempt>> {
+        self.report(node, DeviceIndex(0), job, took_ms * MILLISECOND_NS, None)
     }
 
     /// A node has executed and delivered jobs, each in the time that `took_ms` says.
@@ -331,7 +355,7 @@ impl Farm {
     }
 }
 
-fn hello() -> AppHello {
+pub(crate) fn hello() -> AppHello {
     AppHello {
         protocol: PROTOCOL_VERSION,
         name: "app".to_owned(),

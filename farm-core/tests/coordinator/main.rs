@@ -10,5 +10,6 @@ mod hearing;
 mod inventory;
 mod losses;
 mod policies;
+mod projects;
 mod speculation;
 mod spread;

@@ -13,6 +13,7 @@ use farm_core::{
         NodeToApp, NodeToCoordinator, PROTOCOL_VERSION, Priority, ResultAck,
     },
     program::Content,
+    project::AppTerms,
     time::Instant,
     worker::{Effect, Event, Provider, Share, WorkerConfig, WorkerMachine},
 };
@@ -66,7 +67,8 @@ impl Node {
         let (id, epoch, liveness) = (NodeId(1), Epoch(1), Liveness::default());
         node.tell(Event::FromCoordinator(CoordinatorToNode::Welcome { node: id, epoch, liveness }));
         for app in 1..=apps {
-            node.tell(Event::FromCoordinator(CoordinatorToNode::AppJoined { app: AppId(app), weight: 1.0 }));
+            let terms = AppTerms::unlimited(1.0);
+            node.tell(Event::FromCoordinator(CoordinatorToNode::AppJoined { app: AppId(app), terms }));
             let hello = AppToNode::Hello {
                 protocol: PROTOCOL_VERSION,
                 app: AppId(app),

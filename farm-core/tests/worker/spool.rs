@@ -1,8 +1,9 @@
 //! Results that nobody takes: they cost their application its turn, and nobody else anything.
 
 use farm_core::{
-    id::{ContentHash, DeviceIndex, JobAttempt},
-    message::LatencyClass,
+    id::{AppId, ContentHash, DeviceIndex, JobAttempt},
+    message::{CoordinatorToNode, LatencyClass},
+    project::AppTerms,
     worker::Event,
 };
 
@@ -105,4 +106,42 @@ fn a_result_that_the_driver_lost_is_made_again() {
     node.acknowledge(second);
     node.tell(Event::ResultLost(second));
     assert_eq!(node.machine.held_jobs(), 0, "what is over stays over");
+}
+
+#[test]
+fn a_project_that_leaves_too_much_behind_is_held_back_as_a_whole() {
+    let mut node = Node::new(1, true, 3);
+    for app in [1, 2] {
+        let terms =
+            AppTerms { project: "films".to_owned(), result_bytes: Some(500), ..AppTerms::unlimited(1.0) };
+        node.tell(Event::FromCoordinator(CoordinatorToNode::AppJoined { app: AppId(app), terms }));
+    }
+    let one = node.jobs(1, 0, 5, LatencyClass::Batch);
+    let ran = run_all(&mut node, RESULT_BYTES);
+    assert_eq!(ran, one[..2], "one is over the project's quota, one was staged by then");
+    let sibling = node.jobs(2, 0, 3, LatencyClass::Batch);
+    assert!(node.orders().is_empty(), "nor does the other one of the project get on");
+    let stranger = node.jobs(3, 0, 3, LatencyClass::Batch);
+    assert_eq!(run_all(&mut node, 0), stranger, "who is of another does");
+    ran.into_iter().for_each(|job| node.acknowledge(job));
+    let mut left: usize = one.len() - 2 + sibling.len();
+    while left > 0 {
+        let ran = run_all(&mut node, RESULT_BYTES);
+        assert!(!ran.is_empty(), "{left} jobs are stuck");
+        left -= ran.len();
+        ran.into_iter().for_each(|job| node.acknowledge(job));
+    }
+}
+
+#[test]
+fn an_application_that_stays_is_not_spread_over_siblings() {
+    let mut node = Node::new(2, true, 1);
+    let terms = AppTerms { stays: true, ..AppTerms::unlimited(1.0) };
+    node.tell(Event::FromCoordinator(CoordinatorToNode::AppJoined { app: AppId(1), terms }));
+    node.jobs(1, 0, 6, LatencyClass::Batch);
+    assert!(node.orders().iter().all(|(_, device, _)| *device == 0), "device 1 is idle, and stays so");
+    let terms = AppTerms::unlimited(1.0);
+    node.tell(Event::FromCoordinator(CoordinatorToNode::AppJoined { app: AppId(1), terms }));
+    node.pass_ms(10);
+    assert!(node.orders().iter().any(|(_, device, _)| *device == 1), "the quota was lifted");
 }

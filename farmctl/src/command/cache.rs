@@ -153,7 +153,7 @@ fn resolve(prefix: &str, known: &ContentsStatus) -> Result<ContentHash, Failure>
 }
 
 /// Bytes for people.
-fn size(bytes: u64) -> String {
+pub(crate) fn size(bytes: u64) -> String {
     const UNITS: [&str; 4] = ["KiB", "MiB", "GiB", "TiB"];
     if bytes < 1_024 {
         return format!("{bytes} B");

@@ -8,8 +8,12 @@ use std::{
 };
 
 use anyhow::{Context as _, anyhow};
+use farm_core::project::DEFAULT_PROJECT;
 use proto::{
-    control::{self, Invitation, v1::TokenStatus},
+    control::{
+        self, Invitation,
+        v1::{MemberStatus, TokenStatus},
+    },
     trust::{Identity, JoinToken, Role, check_name, unix_now},
 };
 use serde_json::{Value, json};
@@ -144,13 +148,15 @@ fn keep(identity: &Identity, file: &Path) -> Result<(), Failure> {
 pub(crate) async fn token(verb: &TokenVerb, target: &Target<'_>, format: Format) -> Result<(), Failure> {
     let admin = Admin::new(target.existing().await?);
     match verb {
-        TokenVerb::Create { role, name, expires, uses } => {
+        TokenVerb::Create { role, name, expires, uses, project } => {
             let role = match role {
                 MemberRole::Node => Role::Node,
                 MemberRole::App => Role::App,
                 MemberRole::Operator => Role::Operator,
             };
-            let invitation = Invitation { role, name: name.clone(), lifetime: *expires, uses: *uses };
+            let (name, project) = (name.clone(), project.clone());
+            let invitation =
+                Invitation { role, name: name.clone(), lifetime: *expires, uses: *uses, project: project.clone() };
             let (id, token) = admin.create_token(&invitation).await?;
             let made = json!({
                 "id": id,
@@ -159,6 +165,7 @@ pub(crate) async fn token(verb: &TokenVerb, target: &Target<'_>, format: Format)
                 "name": name,
                 "expires_s": unix_now() + expires.as_secs(),
                 "uses": uses,
+                "project": project,
             });
             // The token alone: scripts take it as it is.
             output::print(&made, format, |_, _| format!("{token}\n"))
@@ -182,6 +189,7 @@ fn shown(token: &TokenStatus) -> Value {
         "expires_s": token.expires_s,
         "uses_left": token.uses_left,
         "maker": token.maker,
+        "project": Some(&token.project).filter(|project| !project.is_empty()),
     })
 }
 
@@ -190,7 +198,7 @@ fn tokens_table(tokens: &[Value]) -> String {
         return "no token can be used: make one with `farmctl token create node|app|operator`\n".to_owned();
     }
     let text = |value: &Value| value.as_str().map_or_else(String::new, printable);
-    let mut table = output::table(["TOKEN", "ROLE", "NAME", "EXPIRES IN", "USES LEFT", "MADE BY"]);
+    let mut table = output::table(["TOKEN", "ROLE", "NAME", "PROJECT", "EXPIRES IN", "USES LEFT", "MADE BY"]);
     for token in tokens {
         let seconds = token["expires_s"].as_u64().unwrap_or(0).saturating_sub(unix_now());
         let minutes = Duration::from_secs(seconds).as_secs().div_ceil(60);
@@ -198,6 +206,7 @@ fn tokens_table(tokens: &[Value]) -> String {
             token["id"].to_string(),
             text(&token["role"]),
             text(&token["name"]),
+            text(&token["project"]),
             format!("{minutes} min"),
             token["uses_left"].to_string(),
             text(&token["maker"]),
@@ -206,15 +215,33 @@ fn tokens_table(tokens: &[Value]) -> String {
     format!("{table}\n")
 }
 
+fn shown_member(member: &MemberStatus) -> Value {
+    json!({
+        "member": member.uri,
+        "project": Some(&member.project).filter(|project| !project.is_empty()),
+    })
+}
+
+/// One in a line, and behind it its project, if that is another than `default`.
+fn members_lines(members: &[Value]) -> String {
+    let line = |member: &Value| {
+        let text = |value: &Value| value.as_str().map_or_else(String::new, printable);
+        let (uri, project) = (text(&member["member"]), text(&member["project"]));
+        match project.as_str() {
+            "" | DEFAULT_PROJECT => uri + "\n",
+            project => format!("{uri}  {project}\n"),
+        }
+    };
+    members.iter().map(line).collect()
+}
+
 /// Runs one of the verbs of members.
 pub(crate) async fn member(verb: &MemberVerb, target: &Target<'_>, format: Format) -> Result<(), Failure> {
     let admin = Admin::new(target.existing().await?);
     match verb {
         MemberVerb::Ls => {
-            let members = admin.members().await?;
-            output::print(&members, format, |members, _| {
-                members.iter().map(|member| printable(member) + "\n").collect()
-            })
+            let members: Vec<Value> = admin.members().await?.iter().map(shown_member).collect();
+            output::print(&members, format, |members, _| members_lines(members))
         }
         MemberVerb::Expel { member } => {
             admin.expel(member).await?;

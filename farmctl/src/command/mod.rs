@@ -5,6 +5,7 @@ pub(crate) mod cache;
 pub(crate) mod membership;
 pub(crate) mod mi;
 pub(crate) mod node;
+pub(crate) mod project;
 pub(crate) mod render;
 pub(crate) mod scene;
 pub(crate) mod status;

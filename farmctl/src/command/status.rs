@@ -37,7 +37,7 @@ fn screen(status: &FarmStatus, wide: bool) -> String {
     }
     if !status.apps.is_empty() {
         text.push('\n');
-        text.push_str(&apps_table(&status.apps));
+        text.push_str(&apps_table(&status.apps, status.projects.len() > 1));
     }
     text
 }
@@ -107,11 +107,17 @@ fn nodes_table(nodes: &[NodeStatus], wide: bool) -> String {
     format!("{table}\n")
 }
 
-fn apps_table(apps: &[AppStatus]) -> String {
-    let mut table =
-        output::table(["APP", "NAME", "LINK", "WEIGHT", "WAITING", "PLACED", "DELIVERED", "DEVICE TIME"]);
+/// A farm of one project does not name it.
+fn apps_table(apps: &[AppStatus], projects: bool) -> String {
+    let mut header =
+        vec!["APP", "NAME", "LINK", "WEIGHT", "WAITING", "PLACED", "DELIVERED", "DEVICE TIME"];
+    if projects {
+        header.push("PROJECT");
+    }
+    let mut table = output::table([]);
+    table.set_header(header);
     for app in apps {
-        table.add_row([
+        let mut row = vec![
             app.app.to_string(),
             printable(&app.name),
             if app.connected { "up" } else { "lost" }.to_owned(),
@@ -120,7 +126,11 @@ fn apps_table(apps: &[AppStatus]) -> String {
             app.outstanding_jobs.to_string(),
             app.delivered_jobs.to_string(),
             seconds(app.device_time_ns),
-        ]);
+        ];
+        if projects {
+            row.push(printable(&app.project));
+        }
+        table.add_row(row);
     }
     format!("{table}\n")
 }
@@ -175,6 +185,7 @@ mod tests {
         let app = AppStatus {
             app: AppId(3),
             name: "render".to_owned(),
+            project: "films".to_owned(),
             weight: 1.0,
             connected: true,
             waiting_jobs: 0,
@@ -186,6 +197,7 @@ mod tests {
             epoch: Epoch(2),
             nodes: vec![node],
             apps: vec![app],
+            projects: Vec::new(),
             delivered_jobs: 7,
             replanned_jobs: 0,
             stolen_jobs: 0,

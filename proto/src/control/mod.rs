@@ -28,7 +28,7 @@ pub mod v1;
 pub use self::{
     convert::{
         MAX_ADDRESSES, MAX_CERTIFICATE_BYTES, MAX_CONTENTS, MAX_ENTRIES, MAX_JOBS, MAX_NAME_BYTES,
-        MAX_TEXT_BYTES, MessageError, WireError, decode, encode, eviction,
+        MAX_TEXT_BYTES, MessageError, WireError, decode, encode, eviction, quota_change,
     },
     incoming::Incoming,
     session::{
@@ -39,5 +39,8 @@ pub use self::{
     transport::{
         ADMIN_TIMEOUT, MAX_MESSAGE_BYTES, admin_server, apps_server, nodes_server, server, trust_server,
     },
-    trust::{Invitation, create_token, expel, join, list_members, list_tokens, renew, revoke_token},
+    trust::{
+        Invitation, create_token, expel, join, list_members, list_tokens, remove_project, renew, revoke_token,
+        set_project,
+    },
 };

@@ -2,10 +2,12 @@
 
 use std::time::Duration;
 
+use farm_core::project::{Quota, QuotaChange};
 use tonic::{Request, transport::Channel};
 
 use super::{
     MAX_MESSAGE_BYTES, SessionError, WireError,
+    convert::set_project_request,
     session::{channel, within_timeout},
     transport,
     v1::{self, trust_client::TrustClient},
@@ -26,6 +28,8 @@ pub struct Invitation {
     pub lifetime: Duration,
     /// How often.
     pub uses: u32,
+    /// The project of who joins; `None`: `default`.
+    pub project: Option<String>,
 }
 
 /// Makes a join token. For operators.
@@ -42,6 +46,7 @@ pub async fn create_token(
         name: invitation.name.clone().unwrap_or_default(),
         lifetime_s: invitation.lifetime.as_secs(),
         uses: invitation.uses,
+        project: invitation.project.clone().unwrap_or_default(),
     };
     let mut client = client(channel(coordinator, identity).await?);
     let made = within_timeout(coordinator, client.create_token(Request::new(request))).await?.into_inner();
@@ -78,18 +83,18 @@ pub async fn revoke_token(
     Ok(())
 }
 
-/// The URIs of the farm's members, in order. For operators.
+/// The farm's members, in order. For operators.
 ///
 /// # Errors
 /// Nobody answers, or the caller is no operator.
 pub async fn list_members(
     coordinator: &str,
     identity: Option<&Identity>,
-) -> Result<Vec<String>, SessionError> {
+) -> Result<Vec<v1::MemberStatus>, SessionError> {
     let mut client = client(channel(coordinator, identity).await?);
     let answer =
         within_timeout(coordinator, client.list_members(Request::new(v1::ListMembersRequest {}))).await?;
-    Ok(answer.into_inner().uris)
+    Ok(answer.into_inner().members)
 }
 
 /// Ends a membership. For operators.
@@ -100,6 +105,38 @@ pub async fn expel(coordinator: &str, identity: Option<&Identity>, uri: &str) ->
     let mut client = client(channel(coordinator, identity).await?);
     let request = v1::ExpelRequest { uri: uri.to_owned() };
     within_timeout(coordinator, client.expel(Request::new(request))).await?;
+    Ok(())
+}
+
+/// Makes a project, or changes what it may have; gives what it may have now. For operators.
+///
+/// # Errors
+/// Nobody answers, the caller is no operator, the name or a bound is none, or there are too many projects.
+pub async fn set_project(
+    coordinator: &str,
+    identity: Option<&Identity>,
+    project: &str,
+    change: QuotaChange,
+) -> Result<Quota, SessionError> {
+    let mut client = client(channel(coordinator, identity).await?);
+    let request = set_project_request(project, change);
+    let answer = within_timeout(coordinator, client.set_project(Request::new(request))).await?;
+    let quota = answer.into_inner().quota.ok_or(WireError::Missing { field: "SetProjectResponse.quota" })?;
+    Ok(quota.try_into()?)
+}
+
+/// Removes a project that nobody belongs to. For operators.
+///
+/// # Errors
+/// Nobody answers, the caller is no operator, there is no such project, or somebody belongs to it.
+pub async fn remove_project(
+    coordinator: &str,
+    identity: Option<&Identity>,
+    project: &str,
+) -> Result<(), SessionError> {
+    let mut client = client(channel(coordinator, identity).await?);
+    let request = v1::RemoveProjectRequest { project: project.to_owned() };
+    within_timeout(coordinator, client.remove_project(Request::new(request))).await?;
     Ok(())
 }
 

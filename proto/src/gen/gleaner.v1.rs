@@ -155,7 +155,7 @@ pub struct AttemptRun {
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct JobFailure {
     /// The cause.
-    #[prost(oneof = "job_failure::Cause", tags = "1, 2, 3, 4, 5, 6, 7, 8, 9")]
+    #[prost(oneof = "job_failure::Cause", tags = "1, 2, 3, 4, 5, 6, 7, 8, 9, 10")]
     pub cause: ::core::option::Option<job_failure::Cause>,
 }
 /// Nested message and enum types in `JobFailure`.
@@ -190,7 +190,26 @@ pub mod job_failure {
         /// Too many attempts of the application's jobs in a row ended with their devices: the last one's words.
         #[prost(string, tag = "9")]
         PoisonApplication(::prost::alloc::string::String),
+        /// It needs more than its application's project may have: of what.
+        #[prost(string, tag = "10")]
+        OverQuota(::prost::alloc::string::String),
     }
+}
+/// What the applications of a project may have together; what is unset has no bound.
+#[derive(Clone, Copy, PartialEq, ::prost::Message)]
+pub struct Quota {
+    /// Devices that jobs are on at a time.
+    #[prost(uint32, optional, tag = "1")]
+    pub devices: ::core::option::Option<u32>,
+    /// Jobs that are planned at a time and not delivered.
+    #[prost(uint64, optional, tag = "2")]
+    pub queued_jobs: ::core::option::Option<u64>,
+    /// Bytes of task allocations and modules for the farm, and of results on each node.
+    #[prost(uint64, optional, tag = "3")]
+    pub bytes: ::core::option::Option<u64>,
+    /// What fair-share weights come to, > 0 and finite.
+    #[prost(double, optional, tag = "4")]
+    pub weight: ::core::option::Option<f64>,
 }
 /// A case that says all by being there.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
@@ -355,7 +374,7 @@ pub struct AppStatus {
     /// For people.
     #[prost(string, tag = "2")]
     pub name: ::prost::alloc::string::String,
-    /// Fair-share weight.
+    /// Fair-share weight that counts: what it asked for, or what its project's quota leaves of that.
     #[prost(double, tag = "3")]
     pub weight: f64,
     /// Whether its connection stands.
@@ -373,6 +392,37 @@ pub struct AppStatus {
     /// Device time received, in nanoseconds.
     #[prost(uint64, tag = "8")]
     pub device_time_ns: u64,
+    /// Its project.
+    #[prost(string, tag = "9")]
+    pub project: ::prost::alloc::string::String,
+}
+/// What the applications of a project have together.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct ProjectStatus {
+    /// Its name.
+    #[prost(string, tag = "1")]
+    pub project: ::prost::alloc::string::String,
+    /// What it may have.
+    #[prost(message, optional, tag = "2")]
+    pub quota: ::core::option::Option<Quota>,
+    /// Its registered applications.
+    #[prost(uint64, tag = "3")]
+    pub apps: u64,
+    /// Devices that its jobs are on.
+    #[prost(uint64, tag = "4")]
+    pub devices: u64,
+    /// Its jobs that are planned and not delivered.
+    #[prost(uint64, tag = "5")]
+    pub queued_jobs: u64,
+    /// Its jobs that wait at the coordinator.
+    #[prost(uint64, tag = "6")]
+    pub waiting_jobs: u64,
+    /// Bytes of task allocations and modules that count for it.
+    #[prost(uint64, tag = "7")]
+    pub bytes: u64,
+    /// What its applications' weights come to.
+    #[prost(double, tag = "8")]
+    pub weight: f64,
 }
 /// The farm.
 #[derive(Clone, PartialEq, ::prost::Message)]
@@ -401,6 +451,9 @@ pub struct FarmStatus {
     /// Batches placed first come, first served since this start because a plug-in failed.
     #[prost(uint64, tag = "8")]
     pub policy_fallbacks: u64,
+    /// Projects by name.
+    #[prost(message, repeated, tag = "9")]
+    pub projects: ::prost::alloc::vec::Vec<ProjectStatus>,
 }
 /// Asks what large contents the caches of nodes hold.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
@@ -1437,6 +1490,8 @@ pub enum WaitReason {
     NoNode = 1,
     /// No device fulfils the requirements.
     NoFittingDevice = 2,
+    /// The application's project has as much as it may have.
+    OverQuota = 3,
 }
 impl WaitReason {
     /// String value of the enum field names used in the ProtoBuf definition.
@@ -1448,6 +1503,7 @@ impl WaitReason {
             Self::Unspecified => "WAIT_REASON_UNSPECIFIED",
             Self::NoNode => "WAIT_REASON_NO_NODE",
             Self::NoFittingDevice => "WAIT_REASON_NO_FITTING_DEVICE",
+            Self::OverQuota => "WAIT_REASON_OVER_QUOTA",
         }
     }
     /// Creates an enum from field names used in the ProtoBuf definition.
@@ -1456,6 +1512,7 @@ impl WaitReason {
             "WAIT_REASON_UNSPECIFIED" => Some(Self::Unspecified),
             "WAIT_REASON_NO_NODE" => Some(Self::NoNode),
             "WAIT_REASON_NO_FITTING_DEVICE" => Some(Self::NoFittingDevice),
+            "WAIT_REASON_OVER_QUOTA" => Some(Self::OverQuota),
             _ => None,
         }
     }
@@ -2022,8 +2079,8 @@ pub struct NodeWelcome {
     #[prost(message, optional, tag = "3")]
     pub liveness: ::core::option::Option<Liveness>,
 }
-/// An application may send jobs.
-#[derive(Clone, Copy, PartialEq, ::prost::Message)]
+/// An application may send jobs; said again when what it may have changes.
+#[derive(Clone, PartialEq, ::prost::Message)]
 pub struct AppJoined {
     /// Which.
     #[prost(uint64, tag = "1")]
@@ -2031,6 +2088,15 @@ pub struct AppJoined {
     /// Fair-share weight, > 0 and finite.
     #[prost(double, tag = "2")]
     pub weight: f64,
+    /// Its project's name.
+    #[prost(string, tag = "3")]
+    pub project: ::prost::alloc::string::String,
+    /// Bytes of results that the project's applications may leave unacknowledged before they get no further device; unset: no bound.
+    #[prost(uint64, optional, tag = "4")]
+    pub result_bytes: ::core::option::Option<u64>,
+    /// Its jobs stay on the devices that they were planned for.
+    #[prost(bool, tag = "5")]
+    pub stays: bool,
 }
 /// Give these attempts up unless they run, and answer.
 #[derive(Clone, PartialEq, ::prost::Message)]
@@ -2376,6 +2442,9 @@ pub struct CreateTokenRequest {
     /// How often, 1 to 100,000; once where it has a name.
     #[prost(uint32, tag = "4")]
     pub uses: u32,
+    /// The project of who joins, which must be there; empty: `default`. Nodes have none.
+    #[prost(string, tag = "5")]
+    pub project: ::prost::alloc::string::String,
 }
 /// The token.
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
@@ -2421,6 +2490,9 @@ pub struct TokenStatus {
     /// Who made it, as a URI.
     #[prost(string, tag = "6")]
     pub maker: ::prost::alloc::string::String,
+    /// The project of who joins; empty: none.
+    #[prost(string, tag = "7")]
+    pub project: ::prost::alloc::string::String,
 }
 /// Takes a token back.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
@@ -2436,12 +2508,72 @@ pub struct RevokeTokenResponse {}
 #[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct ListMembersRequest {}
 /// The members, in order.
-#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+#[derive(Clone, PartialEq, ::prost::Message)]
 pub struct ListMembersResponse {
-    /// gleaner://FARM/ROLE/NAME.
-    #[prost(string, repeated, tag = "1")]
-    pub uris: ::prost::alloc::vec::Vec<::prost::alloc::string::String>,
+    /// By URI.
+    #[prost(message, repeated, tag = "1")]
+    pub members: ::prost::alloc::vec::Vec<MemberStatus>,
 }
+/// A member.
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct MemberStatus {
+    /// gleaner://FARM/ROLE/NAME.
+    #[prost(string, tag = "1")]
+    pub uri: ::prost::alloc::string::String,
+    /// Its project; empty: none.
+    #[prost(string, tag = "2")]
+    pub project: ::prost::alloc::string::String,
+}
+/// Makes a project, or changes what it may have.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct SetProjectRequest {
+    /// Its name.
+    #[prost(string, tag = "1")]
+    pub project: ::prost::alloc::string::String,
+    /// Devices, at most 4,294,967,295; unset, as each of the others: stays as it is.
+    #[prost(message, optional, tag = "2")]
+    pub devices: ::core::option::Option<Bound>,
+    /// Planned jobs.
+    #[prost(message, optional, tag = "3")]
+    pub queued_jobs: ::core::option::Option<Bound>,
+    /// Bytes.
+    #[prost(message, optional, tag = "4")]
+    pub bytes: ::core::option::Option<Bound>,
+    /// Fair-share weight.
+    #[prost(message, optional, tag = "5")]
+    pub weight: ::core::option::Option<WeightBound>,
+}
+/// A bound, or none.
+#[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct Bound {
+    /// Unset: there is no bound.
+    #[prost(uint64, optional, tag = "1")]
+    pub most: ::core::option::Option<u64>,
+}
+/// A bound of a weight, or none.
+#[derive(Clone, Copy, PartialEq, ::prost::Message)]
+pub struct WeightBound {
+    /// > 0 and finite; unset: there is no bound.
+    #[prost(double, optional, tag = "1")]
+    pub most: ::core::option::Option<f64>,
+}
+/// What the project may have now.
+#[derive(Clone, Copy, PartialEq, ::prost::Message)]
+pub struct SetProjectResponse {
+    /// All of it.
+    #[prost(message, optional, tag = "1")]
+    pub quota: ::core::option::Option<Quota>,
+}
+/// Removes a project.
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct RemoveProjectRequest {
+    /// Its name.
+    #[prost(string, tag = "1")]
+    pub project: ::prost::alloc::string::String,
+}
+/// It is none any more.
+#[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct RemoveProjectResponse {}
 /// Ends a membership.
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct ExpelRequest {
@@ -2714,6 +2846,56 @@ pub mod trust_client {
             req.extensions_mut().insert(GrpcMethod::new("gleaner.v1.Trust", "Expel"));
             self.inner.unary(req, path, codec).await
         }
+        /// Makes a project, or changes what it may have. For operators.
+        pub async fn set_project(
+            &mut self,
+            request: impl tonic::IntoRequest<super::SetProjectRequest>,
+        ) -> std::result::Result<
+            tonic::Response<super::SetProjectResponse>,
+            tonic::Status,
+        > {
+            self.inner
+                .ready()
+                .await
+                .map_err(|e| {
+                    tonic::Status::unknown(
+                        format!("Service was not ready: {}", e.into()),
+                    )
+                })?;
+            let codec = tonic_prost::ProstCodec::default();
+            let path = http::uri::PathAndQuery::from_static(
+                "/gleaner.v1.Trust/SetProject",
+            );
+            let mut req = request.into_request();
+            req.extensions_mut()
+                .insert(GrpcMethod::new("gleaner.v1.Trust", "SetProject"));
+            self.inner.unary(req, path, codec).await
+        }
+        /// Removes a project that nobody belongs to. For operators. NOT_FOUND if there is no such project.
+        pub async fn remove_project(
+            &mut self,
+            request: impl tonic::IntoRequest<super::RemoveProjectRequest>,
+        ) -> std::result::Result<
+            tonic::Response<super::RemoveProjectResponse>,
+            tonic::Status,
+        > {
+            self.inner
+                .ready()
+                .await
+                .map_err(|e| {
+                    tonic::Status::unknown(
+                        format!("Service was not ready: {}", e.into()),
+                    )
+                })?;
+            let codec = tonic_prost::ProstCodec::default();
+            let path = http::uri::PathAndQuery::from_static(
+                "/gleaner.v1.Trust/RemoveProject",
+            );
+            let mut req = request.into_request();
+            req.extensions_mut()
+                .insert(GrpcMethod::new("gleaner.v1.Trust", "RemoveProject"));
+            self.inner.unary(req, path, codec).await
+        }
         /// Becomes a member by a token. For everyone, over TLS.
         pub async fn join(
             &mut self,
@@ -2804,6 +2986,22 @@ pub mod trust_server {
             &self,
             request: tonic::Request<super::ExpelRequest>,
         ) -> std::result::Result<tonic::Response<super::ExpelResponse>, tonic::Status>;
+        /// Makes a project, or changes what it may have. For operators.
+        async fn set_project(
+            &self,
+            request: tonic::Request<super::SetProjectRequest>,
+        ) -> std::result::Result<
+            tonic::Response<super::SetProjectResponse>,
+            tonic::Status,
+        >;
+        /// Removes a project that nobody belongs to. For operators. NOT_FOUND if there is no such project.
+        async fn remove_project(
+            &self,
+            request: tonic::Request<super::RemoveProjectRequest>,
+        ) -> std::result::Result<
+            tonic::Response<super::RemoveProjectResponse>,
+            tonic::Status,
+        >;
         /// Becomes a member by a token. For everyone, over TLS.
         async fn join(
             &self,
@@ -3092,6 +3290,94 @@ pub mod trust_server {
                     let inner = self.inner.clone();
                     let fut = async move {
                         let method = ExpelSvc(inner);
+                        let codec = tonic_prost::ProstCodec::default();
+                        let mut grpc = tonic::server::Grpc::new(codec)
+                            .apply_compression_config(
+                                accept_compression_encodings,
+                                send_compression_encodings,
+                            )
+                            .apply_max_message_size_config(
+                                max_decoding_message_size,
+                                max_encoding_message_size,
+                            );
+                        let res = grpc.unary(method, req).await;
+                        Ok(res)
+                    };
+                    Box::pin(fut)
+                }
+                "/gleaner.v1.Trust/SetProject" => {
+                    #[allow(non_camel_case_types)]
+                    struct SetProjectSvc<T: Trust>(pub Arc<T>);
+                    impl<T: Trust> tonic::server::UnaryService<super::SetProjectRequest>
+                    for SetProjectSvc<T> {
+                        type Response = super::SetProjectResponse;
+                        type Future = BoxFuture<
+                            tonic::Response<Self::Response>,
+                            tonic::Status,
+                        >;
+                        fn call(
+                            &mut self,
+                            request: tonic::Request<super::SetProjectRequest>,
+                        ) -> Self::Future {
+                            let inner = Arc::clone(&self.0);
+                            let fut = async move {
+                                <T as Trust>::set_project(&inner, request).await
+                            };
+                            Box::pin(fut)
+                        }
+                    }
+                    let accept_compression_encodings = self.accept_compression_encodings;
+                    let send_compression_encodings = self.send_compression_encodings;
+                    let max_decoding_message_size = self.max_decoding_message_size;
+                    let max_encoding_message_size = self.max_encoding_message_size;
+                    let inner = self.inner.clone();
+                    let fut = async move {
+                        let method = SetProjectSvc(inner);
+                        let codec = tonic_prost::ProstCodec::default();
+                        let mut grpc = tonic::server::Grpc::new(codec)
+                            .apply_compression_config(
+                                accept_compression_encodings,
+                                send_compression_encodings,
+                            )
+                            .apply_max_message_size_config(
+                                max_decoding_message_size,
+                                max_encoding_message_size,
+                            );
+                        let res = grpc.unary(method, req).await;
+                        Ok(res)
+                    };
+                    Box::pin(fut)
+                }
+                "/gleaner.v1.Trust/RemoveProject" => {
+                    #[allow(non_camel_case_types)]
+                    struct RemoveProjectSvc<T: Trust>(pub Arc<T>);
+                    impl<
+                        T: Trust,
+                    > tonic::server::UnaryService<super::RemoveProjectRequest>
+                    for RemoveProjectSvc<T> {
+                        type Response = super::RemoveProjectResponse;
+                        type Future = BoxFuture<
+                            tonic::Response<Self::Response>,
+                            tonic::Status,
+                        >;
+                        fn call(
+                            &mut self,
+                            request: tonic::Request<super::RemoveProjectRequest>,
+                        ) -> Self::Future {
+                            let inner = Arc::clone(&self.0);
+                            let fut = async move {
+                                <T as Trust>::remove_project(&inner, request).await
+                            };
+                            Box::pin(fut)
+                        }
+                    }
+                    let accept_compression_encodings = self.accept_compression_encodings;
+                    let send_compression_encodings = self.send_compression_encodings;
+                    let max_decoding_message_size = self.max_decoding_message_size;
+                    let max_encoding_message_size = self.max_encoding_message_size;
+                    let inner = self.inner.clone();
+                    let fut = async move {
+                        let method = RemoveProjectSvc(inner);
                         let codec = tonic_prost::ProstCodec::default();
                         let mut grpc = tonic::server::Grpc::new(codec)
                             .apply_compression_config(

@@ -3,6 +3,7 @@
 use farm_core::{
     coordinator::{
         AppStatus, ContentStatus, ContentsStatus, DeviceStatus, FarmStatus, NodeState, NodeStatus,
+        ProjectStatus,
     },
     id::{AppId, ContentHash, Epoch, NodeId},
 };
@@ -27,6 +28,7 @@ impl From<FarmStatus> for v1::FarmStatus {
             stolen_jobs: status.stolen_jobs,
             speculations: status.speculations,
             policy_fallbacks: status.policy_fallbacks,
+            projects: status.projects.into_iter().map(Into::into).collect(),
         }
     }
 }
@@ -44,6 +46,7 @@ impl TryFrom<v1::FarmStatus> for FarmStatus {
             stolen_jobs: wire.stolen_jobs,
             speculations: wire.speculations,
             policy_fallbacks: wire.policy_fallbacks,
+            projects: list("FarmStatus.projects", MAX_ENTRIES, wire.projects)?,
         })
     }
 }
@@ -132,6 +135,7 @@ impl From<AppStatus> for v1::AppStatus {
             outstanding_jobs: app.outstanding_jobs,
             delivered_jobs: app.delivered_jobs,
             device_time_ns: app.device_time_ns,
+            project: app.project,
         }
     }
 }
@@ -149,6 +153,39 @@ impl TryFrom<v1::AppStatus> for AppStatus {
             outstanding_jobs: wire.outstanding_jobs,
             delivered_jobs: wire.delivered_jobs,
             device_time_ns: wire.device_time_ns,
+            project: name("AppStatus.project", wire.project)?,
+        })
+    }
+}
+
+impl From<ProjectStatus> for v1::ProjectStatus {
+    fn from(project: ProjectStatus) -> Self {
+        Self {
+            project: project.project,
+            quota: Some(project.quota.into()),
+            apps: project.apps,
+            devices: project.devices,
+            queued_jobs: project.queued_jobs,
+            waiting_jobs: project.waiting_jobs,
+            bytes: project.bytes,
+            weight: project.weight,
+        }
+    }
+}
+
+impl TryFrom<v1::ProjectStatus> for ProjectStatus {
+    type Error = WireError;
+
+    fn try_from(wire: v1::ProjectStatus) -> Result<Self, WireError> {
+        Ok(Self {
+            project: name("ProjectStatus.project", wire.project)?,
+            quota: required("ProjectStatus.quota", wire.quota)?.try_into()?,
+            apps: wire.apps,
+            devices: wire.devices,
+            queued_jobs: wire.queued_jobs,
+            waiting_jobs: wire.waiting_jobs,
+            bytes: wire.bytes,
+            weight: score("ProjectStatus.weight", wire.weight)?,
         })
     }
 }

@@ -213,6 +213,7 @@ impl From<WaitReason> for v1::WaitReason {
         match reason {
             WaitReason::NoNode => Self::NoNode,
             WaitReason::NoFittingDevice => Self::NoFittingDevice,
+            WaitReason::OverQuota => Self::OverQuota,
         }
     }
 }
@@ -223,6 +224,7 @@ fn wait_reason(reason: i32) -> Result<WaitReason, WireError> {
         v1::WaitReason::Unspecified => Err(WireError::Missing { field: FIELD }),
         v1::WaitReason::NoNode => Ok(WaitReason::NoNode),
         v1::WaitReason::NoFittingDevice => Ok(WaitReason::NoFittingDevice),
+        v1::WaitReason::OverQuota => Ok(WaitReason::OverQuota),
     }
 }
 

@@ -6,9 +6,11 @@ mod apps;
 mod attempts;
 mod model;
 mod nodes;
+mod project;
 mod timeline;
 
-pub use self::admin::eviction;
+pub(super) use self::project::set_project_request;
+pub use self::{admin::eviction, project::quota_change};
 use farm_core::id::DeviceIndex;
 use prost::Message;
 use thiserror::Error;

@@ -195,6 +195,7 @@ impl From<JobFailure> for v1::JobFailure {
             JobFailure::ContentUnavailable(hash) => Cause::ContentUnavailable(hash.0.to_vec()),
             JobFailure::Poison(reason) => Cause::Poison(cut(reason)),
             JobFailure::PoisonApplication(reason) => Cause::PoisonApplication(cut(reason)),
+            JobFailure::OverQuota(reason) => Cause::OverQuota(cut(reason)),
             JobFailure::Cancelled => Cause::Cancelled(v1::Nothing {}),
             JobFailure::Returned => Cause::Returned(v1::Nothing {}),
         };
@@ -221,6 +222,7 @@ impl TryFrom<v1::JobFailure> for JobFailure {
             Cause::PoisonApplication(reason) => {
                 Self::PoisonApplication(text("JobFailure.poison_application", reason)?)
             }
+            Cause::OverQuota(reason) => Self::OverQuota(text("JobFailure.over_quota", reason)?),
             Cause::Cancelled(v1::Nothing {}) => Self::Cancelled,
             Cause::Returned(v1::Nothing {}) => Self::Returned,
         })

@@ -8,6 +8,7 @@ use farm_core::{
         RunningJob,
     },
     program::Content,
+    project::AppTerms,
     time::Instant,
 };
 
@@ -267,9 +268,13 @@ impl From<CoordinatorToNode> for v1::CoordinatorToNode {
                 liveness: Some(liveness.into()),
             }),
             CoordinatorToNode::Refused { reason } => Message::Refused(v1::Refused { reason: cut(reason) }),
-            CoordinatorToNode::AppJoined { app, weight } => {
-                Message::AppJoined(v1::AppJoined { app: app.0, weight })
-            }
+            CoordinatorToNode::AppJoined { app, terms } => Message::AppJoined(v1::AppJoined {
+                app: app.0,
+                weight: terms.weight,
+                project: terms.project,
+                result_bytes: terms.result_bytes,
+                stays: terms.stays,
+            }),
             CoordinatorToNode::AppLeft { app } => Message::AppLeft(v1::AppLeft { app: app.0 }),
             CoordinatorToNode::Cancel { jobs } => Message::Cancel(jobs.as_slice().into()),
             CoordinatorToNode::Retract { steal, jobs } => {
@@ -303,9 +308,15 @@ impl TryFrom<v1::CoordinatorToNode> for CoordinatorToNode {
                 liveness: required("NodeWelcome.liveness", welcome.liveness)?.into(),
             },
             Message::Refused(refused) => Self::Refused { reason: text("Refused.reason", refused.reason)? },
-            Message::AppJoined(joined) => {
-                Self::AppJoined { app: AppId(joined.app), weight: weight("AppJoined.weight", joined.weight)? }
-            }
+            Message::AppJoined(joined) => Self::AppJoined {
+                app: AppId(joined.app),
+                terms: AppTerms {
+                    weight: weight("AppJoined.weight", joined.weight)?,
+                    project: name("AppJoined.project", joined.project)?,
+                    result_bytes: joined.result_bytes,
+                    stays: joined.stays,
+                },
+            },
             Message::AppLeft(v1::AppLeft { app }) => Self::AppLeft { app: AppId(app) },
             Message::Cancel(jobs) => Self::Cancel { jobs: jobs.try_into()? },
             Message::Retract(order) => Self::Retract {
