@@ -605,7 +605,8 @@ mod tests {
             for token in 0..life {
                 let maker = "x".repeat(300 * token as usize);
                 let (role, name) = ("node".to_owned(), String::new());
-                let token = Token { id: 0, role, name, expires_s: 2, uses_left: 1, maker, project: String::new() };
+                let token =
+                    Token { id: 0, role, name, expires_s: 2, uses_left: 1, maker, project: String::new() };
                 store.add_token(&life.to_le_bytes(), token, u64::from(life) % 3).unwrap();
             }
             store.remove_token(u64::from(life)).unwrap();

@@ -57,7 +57,13 @@ impl Farm {
 }
 
 fn invitation(role: Role, name: Option<&str>) -> Invitation {
-    Invitation { role, name: name.map(str::to_owned), lifetime: Duration::from_secs(60), uses: 1, project: None }
+    Invitation {
+        role,
+        name: name.map(str::to_owned),
+        lifetime: Duration::from_secs(60),
+        uses: 1,
+        project: None,
+    }
 }
 
 async fn token(address: &str, operator: &Identity, invitation: &Invitation) -> JoinToken {

@@ -198,7 +198,8 @@ fn coordinator_to_app() -> impl Strategy<Value = CoordinatorToApp> {
             CoordinatorToApp::Plan(Plan { batch: batch.map(BatchId), speculative, nodes })
         },
     );
-    let reason = prop::sample::select(vec![WaitReason::NoNode, WaitReason::NoFittingDevice, WaitReason::OverQuota]);
+    let reason =
+        prop::sample::select(vec![WaitReason::NoNode, WaitReason::NoFittingDevice, WaitReason::OverQuota]);
     prop_oneof![
         (any::<(u64, u32, u32)>(), liveness()).prop_map(|((app, life, epoch), liveness)| {
             CoordinatorToApp::Welcome {
@@ -396,18 +397,16 @@ fn farm_status() -> impl Strategy<Value = FarmStatus> {
         },
     );
     let parts = (vec(node, 0..4), vec(app, 0..4), vec(project, 0..4));
-    (any::<(u32, [u64; 5])>(), parts).prop_map(|((epoch, counts), (nodes, apps, projects))| {
-        FarmStatus {
-            projects,
-            epoch: Epoch(epoch),
-            nodes,
-            apps,
-            delivered_jobs: counts[0],
-            replanned_jobs: counts[1],
-            stolen_jobs: counts[2],
-            speculations: counts[3],
-            policy_fallbacks: counts[4],
-        }
+    (any::<(u32, [u64; 5])>(), parts).prop_map(|((epoch, counts), (nodes, apps, projects))| FarmStatus {
+        projects,
+        epoch: Epoch(epoch),
+        nodes,
+        apps,
+        delivered_jobs: counts[0],
+        replanned_jobs: counts[1],
+        stolen_jobs: counts[2],
+        speculations: counts[3],
+        policy_fallbacks: counts[4],
     })
 }
 

@@ -90,6 +90,12 @@ fn jobs_in_parts() {
 }
 
 #[test]
+fn projects() {
+    let checks = sweep("projects", 0..250);
+    assert!(checks.full_projects > 0 && checks.steals > 0, "no project had as much as it may have");
+}
+
+#[test]
 fn classes() {
     let Checks { yields, executions, .. } = sweep("classes", 0..250);
     assert!(yields > 0 && executions > 0, "no job made way");

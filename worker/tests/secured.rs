@@ -41,8 +41,13 @@ impl SecuredFarm {
     }
 
     async fn join(&self, role: Role, name: &str) -> Identity {
-        let invitation =
-            Invitation { role, name: Some(name.to_owned()), lifetime: Duration::from_secs(60), uses: 1, project: None };
+        let invitation = Invitation {
+            role,
+            name: Some(name.to_owned()),
+            lifetime: Duration::from_secs(60),
+            uses: 1,
+            project: None,
+        };
         let (_, token) =
             control::create_token(&self.address, Some(&self.operator), &invitation).await.unwrap();
         control::join(&self.address, &token, None).await.unwrap()

@@ -24,7 +24,8 @@ impl Store {
                 return Err(StoreError::Denied(format!("{MAX_PROJECTS} projects are there already")));
             }
             let after = change.apply(before.unwrap_or_default());
-            let text = serde_json::to_string(&after).map_err(|error| StoreError::Broken(error.to_string()))?;
+            let text =
+                serde_json::to_string(&after).map_err(|error| StoreError::Broken(error.to_string()))?;
             projects.insert(name, text.as_str()).map_err(broken)?;
             Ok(after)
         })

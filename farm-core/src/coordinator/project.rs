@@ -61,7 +61,8 @@ impl Project {
     }
 
     fn may_use(&self, place: Place) -> bool {
-        let has_room = |most| self.devices.len() + usize::from(!self.devices.contains_key(&place)) <= most as usize;
+        let has_room =
+            |most| self.devices.len() + usize::from(!self.devices.contains_key(&place)) <= most as usize;
         self.quota.devices.is_none_or(has_room)
     }
 }
@@ -291,9 +292,8 @@ impl CoordinatorMachine {
             return;
         }
         let relieved = std::mem::take(&mut self.projects.relieved);
-        let is_relieved = |pending: &Pending| {
-            self.projects.of.get(&pending.app).is_none_or(|slot| relieved.contains(slot))
-        };
+        let is_relieved =
+            |pending: &Pending| self.projects.of.get(&pending.app).is_none_or(|slot| relieved.contains(slot));
         let (again, waits): (Vec<_>, Vec<_>) =
             std::mem::take(&mut self.over_quota).into_iter().partition(is_relieved);
         self.over_quota = waits.into();

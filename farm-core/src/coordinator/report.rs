@@ -42,7 +42,8 @@ impl CoordinatorMachine {
         }
     }
 
-    /// Its node moves what was queued there to devices that stand in for it, and gives it back where there is none.
+    /// Its node moves what was queued there to devices that stand in for it, and gives it back where there is none or where
+    /// jobs have to stay on their devices.
     pub(super) fn device_lost(&mut self, now: Instant, id: NodeId, index: DeviceIndex, reason: &str) {
         tracing::warn!(node = %id, device = %index, reason, "device lost");
         let Some(node) = self.nodes.get_mut(&id) else { return };
@@ -50,7 +51,9 @@ impl CoordinatorMachine {
         device.lost = true;
         device.running = None;
         for job in node.jobs.iter().copied().collect::<Vec<_>>() {
-            self.follow_to_sibling(now, id, index, job);
+            if self.projects.quota_of(job.app).devices.is_none() {
+                self.follow_to_sibling(now, id, index, job);
+            }
         }
     }
 
@@ -105,7 +108,7 @@ impl CoordinatorMachine {
                 }
             }
             Some(JobFailure::Returned) => {
-                if !self.drains(node) {
+                if !self.drains(node) && !self.is_lost(node, device) {
                     self.node_full(now, node);
                 }
                 self.requeue(id, Some(node));
@@ -193,6 +196,11 @@ impl CoordinatorMachine {
             self.history.note(&app.name, job.index, point_ns);
         }
         self.keep_speeds(id, index);
+    }
+
+    fn is_lost(&self, id: NodeId, index: DeviceIndex) -> bool {
+        let device = self.nodes.get(&id).and_then(|node| node.devices.get(usize::from(index.0)));
+        device.is_some_and(|device| device.lost)
     }
 
     fn node_full(&mut self, now: Instant, id: NodeId) {

@@ -516,4 +516,3 @@ fn can_answer(node: &Node) -> bool {
 fn reaches(app: &App, now: Instant, node: NodeId) -> bool {
     app.link.is_some() && app.can_reach(now, node)
 }
-

@@ -244,11 +244,14 @@ impl WorkerMachine {
         (0_u16..).zip(&self.devices).filter(|(_, device)| device.lost).map(|(index, _)| DeviceIndex(index))
     }
 
-    /// The device itself, or a sibling that stands in for it if it is lost.
-    pub(super) fn standing_device(&self, index: DeviceIndex) -> Option<DeviceIndex> {
+    /// The device itself, or a sibling that stands in for it if it is lost and the application's jobs may go there.
+    pub(super) fn standing_device(&self, index: DeviceIndex, app: AppId) -> Option<DeviceIndex> {
         let planned = self.devices.get(usize::from(index.0))?;
         if !planned.lost {
             return Some(index);
+        }
+        if self.apps.get(&app).is_some_and(|app| app.stays) {
+            return None;
         }
         let siblings = (0_u16..).zip(&self.devices).filter(|(_, device)| device.stands_in_for(planned));
         let backlog = |device: &Device| device.queued_ns as f64 / self.speed(device);
@@ -266,7 +269,7 @@ impl WorkerMachine {
     }
 
     fn move_or_give_back(&mut self, now: Instant, job: JobAttempt, lost: DeviceIndex) {
-        let Some(to) = self.standing_device(lost) else { return self.give_back(now, job) };
+        let Some(to) = self.standing_device(lost, job.job.app) else { return self.give_back(now, job) };
         let Some(held) = self.jobs.get_mut(&job.job) else { return };
         held.device = to;
         let (rank, cost) = (held.rank(job.job), held.cost);

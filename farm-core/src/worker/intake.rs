@@ -36,7 +36,8 @@ impl WorkerMachine {
             self.drop_job(older);
         }
         let full = self.jobs.len() >= self.config.max_jobs;
-        let device = self.standing_device(ticket.device).filter(|_| !full && self.drain == Drain::No);
+        let device = self.standing_device(ticket.device, id.app);
+        let device = device.filter(|_| !full && self.drain == Drain::No);
         let Some(device) = device else {
             self.give_back_ticket(now, ticket.job, ticket.device);
             return;

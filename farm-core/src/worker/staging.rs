@@ -142,7 +142,8 @@ impl WorkerMachine {
             |victim: &Device| self.remaining_ns(now, victim) + victim.queued_ns() as f64 / self.speed(victim);
         let moves = |app: &App| !app.stays;
         let has_loot = |victim: &Device| {
-            victim.queues().keys().filter_map(|app| self.apps.get(app)).any(moves) && own.stands_in_for(victim)
+            victim.queues().keys().filter_map(|app| self.apps.get(app)).any(moves)
+                && own.stands_in_for(victim)
         };
         let victims = (0_u16..)
             .map(DeviceIndex)

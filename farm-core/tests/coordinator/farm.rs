@@ -10,8 +10,8 @@ use farm_core::{
     },
     device::{DeviceInfo, DeviceKind, Features, Limits, Requirements},
     id::{
-        AppId, AppIncarnation, BatchId, ContentHash, DeviceIndex, Epoch, JobAttempt, JobIndex, LinkId, NodeSession,
-        TaskId,
+        AppId, AppIncarnation, BatchId, ContentHash, DeviceIndex, Epoch, JobAttempt, JobIndex, LinkId,
+        NodeSession, TaskId,
     },
     message::{
         AppHello, AppToCoordinator, CacheFigures, Contact, CoordinatorToApp, CoordinatorToNode, CostNs,

@@ -122,7 +122,11 @@ fn weights_of_a_project_come_to_no_more_than_its_quota() {
     let alone = joins(&mut farm, 50, "films", 2.0);
     assert_eq!(farm.terms[&alone].weight, 2.0, "it is below");
     let other = joins(&mut farm, 51, "films", 4.0);
-    assert_eq!((farm.terms[&alone].weight, farm.terms[&other].weight), (1.0, 2.0), "each half of what it asked");
+    assert_eq!(
+        (farm.terms[&alone].weight, farm.terms[&other].weight),
+        (1.0, 2.0),
+        "each half of what it asked"
+    );
     let first = farm.machine.status().apps[0].app;
     assert_eq!(farm.terms[&first].weight, 1.0, "another project's is as it was");
     farm.handle(Event::FromApp { link: LinkId(51), message: AppToCoordinator::Goodbye });

@@ -155,8 +155,13 @@ pub(crate) async fn token(verb: &TokenVerb, target: &Target<'_>, format: Format)
                 MemberRole::Operator => Role::Operator,
             };
             let (name, project) = (name.clone(), project.clone());
-            let invitation =
-                Invitation { role, name: name.clone(), lifetime: *expires, uses: *uses, project: project.clone() };
+            let invitation = Invitation {
+                role,
+                name: name.clone(),
+                lifetime: *expires,
+                uses: *uses,
+                project: project.clone(),
+            };
             let (id, token) = admin.create_token(&invitation).await?;
             let made = json!({
                 "id": id,

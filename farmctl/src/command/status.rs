@@ -109,8 +109,7 @@ fn nodes_table(nodes: &[NodeStatus], wide: bool) -> String {
 
 /// A farm of one project does not name it.
 fn apps_table(apps: &[AppStatus], projects: bool) -> String {
-    let mut header =
-        vec!["APP", "NAME", "LINK", "WEIGHT", "WAITING", "PLACED", "DELIVERED", "DEVICE TIME"];
+    let mut header = vec!["APP", "NAME", "LINK", "WEIGHT", "WAITING", "PLACED", "DELIVERED", "DEVICE TIME"];
     if projects {
         header.push("PROJECT");
     }

@@ -40,7 +40,7 @@ pub use self::{
         ADMIN_TIMEOUT, MAX_MESSAGE_BYTES, admin_server, apps_server, nodes_server, server, trust_server,
     },
     trust::{
-        Invitation, create_token, expel, join, list_members, list_tokens, remove_project, renew, revoke_token,
-        set_project,
+        Invitation, create_token, expel, join, list_members, list_tokens, remove_project, renew,
+        revoke_token, set_project,
     },
 };

@@ -6,7 +6,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use farm_core::{
-    coordinator::Event,
+    coordinator::{Event, ProjectStatus},
     id::{AppId, Attempt, JobAttempt, JobId, NodeId},
     message::{CoordinatorToApp, JobFailure, NodeToCoordinator, Plan},
     time::Instant,
@@ -60,6 +60,8 @@ pub struct Checks {
     pub peer_fetches: u64,
     /// Batches that a plug-in had answered for.
     pub plugin_answers: u64,
+    /// Projects with as much as they may have, held against their quotas (I8).
+    pub full_projects: u64,
 }
 
 impl Checks {
@@ -78,6 +80,7 @@ impl Checks {
             yields: self.yields + other.yields,
             peer_fetches: self.peer_fetches + other.peer_fetches,
             plugin_answers: self.plugin_answers + other.plugin_answers,
+            full_projects: self.full_projects + other.full_projects,
         }
     }
 }
@@ -142,6 +145,8 @@ pub struct Auditor {
     settled: usize,
     /// Of the coordinator that speaks.
     epoch: u32,
+    /// Devices and planned jobs that each project had when a quota was changed, or fewer since.
+    had: BTreeMap<String, (u64, u64)>,
     /// What was there to be judged.
     pub checks: Checks,
 }
@@ -150,6 +155,24 @@ impl Auditor {
     /// Another coordinator speaks.
     pub(super) fn coordinator_began(&mut self, epoch: u32) {
         self.epoch = epoch;
+    }
+
+    /// A quota may be less now than what a project has.
+    pub(super) fn quotas_changed(&mut self, projects: &[ProjectStatus]) {
+        let has = |project: &ProjectStatus| (project.devices, project.queued_jobs);
+        self.had = projects.iter().map(|project| (project.project.clone(), has(project))).collect();
+    }
+
+    /// I8: what a project has is within its quota, or goes down.
+    pub(super) fn projects_have(&mut self, projects: &[ProjectStatus]) {
+        for ProjectStatus { project, quota, devices, queued_jobs, .. } in projects {
+            let had = self.had.entry(project.clone()).or_default();
+            let quotas = (quota.devices.map_or(u64::MAX, u64::from), quota.queued_jobs.unwrap_or(u64::MAX));
+            assert!(*devices <= quotas.0.max(had.0), "I8: {project} is on {devices} devices: {quota:?}");
+            assert!(*queued_jobs <= quotas.1.max(had.1), "I8: {project} has {queued_jobs} jobs: {quota:?}");
+            *had = (had.0.min(*devices), had.1.min(*queued_jobs));
+            self.checks.full_projects += u64::from(*devices == quotas.0 || *queued_jobs == quotas.1);
+        }
     }
 
     /// Has the machines check their own books after every single event.

@@ -5,6 +5,7 @@ use std::time::Duration;
 use farm_core::{
     coordinator,
     id::{DeviceIndex, LinkId, NodeId},
+    project::Quota,
     worker,
 };
 
@@ -167,6 +168,13 @@ pub enum Fault {
         /// Which.
         app: usize,
     },
+    /// An operator changes what a project may have.
+    Quota {
+        /// Which.
+        project: &'static str,
+        /// What it may have.
+        quota: Quota,
+    },
     /// No fault follows.
     Calm,
 }
@@ -249,6 +257,7 @@ impl World {
             Fault::StartCoordinator => self.start_coordinator(),
             Fault::Vanish { app, back } => self.vanish_app(app, back),
             Fault::Return { app } => self.return_app(app),
+            Fault::Quota { project, quota } => self.set_quota(project, quota),
             Fault::Calm => self.calm_down(),
         }
     }
@@ -273,5 +282,10 @@ impl World {
         }
         self.heal_devices();
         self.start_coordinator();
+        for (project, quota) in self.store.quotas.clone() {
+            let devices = quota.devices.map(|most| most.max(1));
+            let queued_jobs = quota.queued_jobs.map(|most| most.max(1));
+            self.set_quota(&project, Quota { devices, queued_jobs, ..quota });
+        }
     }
 }

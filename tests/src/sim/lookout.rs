@@ -59,7 +59,9 @@ impl World {
             return;
         }
         self.lookout.next = to.after(PERIOD);
-        self.look_for_idleness();
+        if !self.setup.projects {
+            self.look_for_idleness();
+        }
         self.look_for_jobs();
     }
 

@@ -180,6 +180,27 @@ pub const SCENARIOS: &[Scenario] = &[
         ]),
     },
     Scenario {
+        name: "projects",
+        about: "projects with quotas that change, while nodes, devices, applications and the coordinator come and go",
+        story: Story::Weather(&[
+            Kind::Projects,
+            Kind::Breaks,
+            Kind::Restarts,
+            Kind::Deaths,
+            Kind::Coordinator,
+            Kind::Orphans,
+            Kind::Resumes,
+            Kind::Grey,
+            Kind::DeviceLoss,
+            Kind::Poison,
+            Kind::Crashes,
+            Kind::Drains,
+            Kind::Joins,
+            Kind::Cancels,
+            Kind::Stealing,
+        ]),
+    },
+    Scenario {
         name: "losses",
         about: "tickets, acknowledgements, orders and reports are lost on connections that stand; only comparisons tell",
         story: Story::Weather(&[

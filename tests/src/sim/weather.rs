@@ -6,13 +6,14 @@ use farm_core::{
     coordinator::policy::{HISTORY, NEIGHBOURS},
     id::{DeviceIndex, TaskId},
     ledger::Event,
+    project::Quota,
     time::Instant,
 };
 use rand::{Rng, SeedableRng, rngs::SmallRng};
 
 use super::{
     faults::Fault,
-    hosts::PLUGIN,
+    hosts::{PLUGIN, PROJECTS},
     network::{Distances, Duplicates, Proc},
     world::{Happening, MILLISECOND, Setup, World},
 };
@@ -79,6 +80,8 @@ pub(super) enum Kind {
     Plugins,
     /// Applications choose a policy that learns. As `Plugins`.
     Parts,
+    /// Applications belong to projects with quotas, which change. As `Plugins`.
+    Projects,
 }
 
 impl Kind {
@@ -129,9 +132,12 @@ impl Weather {
         let density = [0.1, 0.3, 0.6][rng.random_range(0..3)];
         let policy = policy_of(seed, kinds);
         let interactive = kinds.contains(&Kind::Classes);
+        let projects = kinds.contains(&Kind::Projects);
         let mut drawn: BTreeSet<Kind> = kinds.iter().copied().filter(|_| rng.random_bool(density)).collect();
-        if kinds.contains(&Kind::Losses) {
-            drawn.insert(Kind::Losses);
+        for always in [Kind::Losses, Kind::Projects] {
+            if kinds.contains(&always) {
+                drawn.insert(always);
+            }
         }
         let kinds = drawn;
         let has = |kind| kinds.contains(&kind);
@@ -148,6 +154,7 @@ impl Weather {
             max_jobs: if rng.random_bool(0.3) { 40 } else { 10_000 },
             global_stealing: has(Kind::Stealing),
             interactive,
+            projects,
             policy,
             score_error: if has(Kind::Scores) { 3.0 } else { 1.0 },
             skewed_clocks: has(Kind::Skew),
@@ -168,6 +175,12 @@ impl Weather {
     /// Lets the weather come over a farm: work, faults, and calm at the end.
     pub(super) fn come_over(mut self, world: &mut World) {
         self.submit(world);
+        if self.has(Kind::Projects) {
+            for project in PROJECTS {
+                let quota = self.quota(false);
+                world.fault(Fault::Quota { project, quota });
+            }
+        }
         if self.has_poison() {
             world.work.poison.insert(TaskId(1));
         }
@@ -241,6 +254,10 @@ impl Weather {
             Kind::DeviceLoss => Fault::LoseDevice { worker: other, device },
             Kind::Drains if rng.random_bool(0.5) => Fault::Drain { worker: other },
             Kind::Drains => Fault::Terminate { worker: other },
+            Kind::Projects => {
+                let project = PROJECTS[rng.random_range(0..PROJECTS.len())];
+                Fault::Quota { project, quota: self.quota(true) }
+            }
             Kind::Joins => Fault::Join { speeds: vec![rng.random_range(0.5..2.0)] },
             Kind::Cancels => {
                 return Some(Happening::App { app, event: Event::Cancelled(TaskId(rng.random_range(0..3))) });
@@ -259,6 +276,21 @@ impl Weather {
             | Kind::Parts => return None,
         };
         Some(Happening::Fault(fault))
+    }
+}
+
+impl Weather {
+    /// What a project may have; while there is trouble that may be nothing.
+    fn quota(&mut self, nothing: bool) -> Quota {
+        let rng = &mut self.rng;
+        let least = u32::from(!nothing);
+        Quota {
+            devices: rng.random_bool(0.5).then(|| rng.random_range(least..5)),
+            queued_jobs: rng.random_bool(0.5).then(|| rng.random_range(least..40).into()),
+            // Above what a task has.
+            bytes: rng.random_bool(0.5).then_some(5 << 20),
+            weight: rng.random_bool(0.5).then(|| rng.random_range(0.5..4.0)),
+        }
     }
 }
 

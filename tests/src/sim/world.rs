@@ -196,6 +196,8 @@ pub struct Setup {
     pub global_stealing: bool,
     /// Every other application's jobs are interactive.
     pub interactive: bool,
+    /// Applications belong to projects, whose quotas keep devices idle.
+    pub projects: bool,
     /// What the applications choose; a plug-in answers well, wrongly, late or never.
     pub policy: &'static str,
     /// Announced scores are wrong by up to this factor, either way.
@@ -221,6 +223,7 @@ impl Setup {
             app_lease_ms: SHORT_APP_LEASE_MS,
             global_stealing: false,
             interactive: false,
+            projects: false,
             policy: "",
             score_error: 1.0,
             skewed_clocks: false,

@@ -39,8 +39,7 @@ pub(in crate::control) fn set_project_request(project: &str, change: QuotaChange
 /// # Errors
 /// A bound is not one.
 pub fn quota_change(wire: v1::SetProjectRequest) -> Result<(String, QuotaChange), WireError> {
-    let devices =
-        |most: u64| u32::try_from(most).map_err(|_| invalid("SetProjectRequest.devices", most));
+    let devices = |most: u64| u32::try_from(most).map_err(|_| invalid("SetProjectRequest.devices", most));
     let most_weight = |most| weight("SetProjectRequest.weight", most);
     let change = QuotaChange {
         devices: wire.devices.map(|bound| bound.most.map(devices).transpose()).transpose()?,

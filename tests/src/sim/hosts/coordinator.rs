@@ -9,7 +9,8 @@ use farm_core::{
         policy::{Choice, Question, QuestionId},
     },
     id::{Epoch, LinkId},
-    message::CoordinatorToNode,
+    message::{AppToCoordinator, CoordinatorToNode},
+    project::{DEFAULT_PROJECT, Quota},
     time::Instant,
 };
 use rand::{Rng as _, SeedableRng as _, rngs::SmallRng};
@@ -23,6 +24,9 @@ use crate::sim::{
 /// The plug-in that the coordinator knows.
 pub(in crate::sim) const PLUGIN: &str = "plugin";
 
+/// The projects of applications, by turns.
+pub(in crate::sim) const PROJECTS: [&str; 2] = [DEFAULT_PROJECT, "films"];
+
 /// What survives the coordinator's process: what it committed.
 #[derive(Clone, Debug)]
 pub(in crate::sim) struct Store {
@@ -30,11 +34,12 @@ pub(in crate::sim) struct Store {
     /// Until when, in the world's time, and what the machine said of it.
     stopped: Vec<(Instant, Stopped)>,
     speeds: BTreeMap<String, NodeSpeeds>,
+    pub(in crate::sim) quotas: BTreeMap<String, Quota>,
 }
 
 impl Store {
     pub(in crate::sim) const fn new() -> Self {
-        Self { epoch: 1, stopped: Vec::new(), speeds: BTreeMap::new() }
+        Self { epoch: 1, stopped: Vec::new(), speeds: BTreeMap::new(), quotas: BTreeMap::new() }
     }
 
     fn keep(&mut self, now: Instant, keep: Keep) {
@@ -63,6 +68,7 @@ impl Store {
             max_crashes: setup.max_crashes,
             plugins: [PLUGIN.to_owned()].into(),
             restored: self.restored(now),
+            quotas: self.quotas.clone(),
             ..config
         })
     }
@@ -100,6 +106,7 @@ impl World {
         if !self.coordinator_up {
             return;
         }
+        self.introduce(&event);
         let before = self.coordinator.stolen_jobs();
         let answer = Auditor::steal_answer(&event);
         self.coordinator.handle(self.coordinator_clock.shows(self.now), event);
@@ -107,9 +114,36 @@ impl World {
         self.coordinator_settles();
     }
 
+    /// Whose the connection is on which an application says hello.
+    fn introduce(&mut self, event: &Event) {
+        let Event::FromApp { link, message: AppToCoordinator::Hello(_) } = event else { return };
+        let dialler = self.links.get(link).map(|link| link.dialler);
+        if let (true, Some(Proc::App(app))) = (self.setup.projects, dialler) {
+            let project = PROJECTS[app % PROJECTS.len()].to_owned();
+            let now = self.coordinator_clock.shows(self.now);
+            self.coordinator.handle(now, Event::AppIntroduced { link: *link, project });
+        }
+    }
+
+    /// An operator changes what a project may have.
+    pub(in crate::sim) fn set_quota(&mut self, project: &str, quota: Quota) {
+        self.store.quotas.insert(project.to_owned(), quota);
+        self.audit.quotas_changed(&self.coordinator.status().projects);
+        self.coordinator_event(Event::QuotaSet { project: project.to_owned(), quota });
+    }
+
+    /// I8: a project has no more than its quota, or than it had when that was lowered.
+    fn judge_projects(&mut self) {
+        // What goes on over a restart is not counted until its node and its application are both back.
+        if self.setup.projects && self.store.epoch == 1 {
+            self.audit.projects_have(&self.coordinator.status().projects);
+        }
+    }
+
     pub(in crate::sim) fn coordinator_settles(&mut self) {
         if self.audit.is_due() {
             self.coordinator.check_invariants();
+            self.judge_projects();
         }
         while let Some(effect) = self.coordinator.poll_effect() {
             self.log.enter(self.now, Proc::Coordinator, &effect);

@@ -5,7 +5,7 @@ mod app;
 mod coordinator;
 mod worker;
 
-pub(super) use self::coordinator::{PLUGIN, Store};
+pub(super) use self::coordinator::{PLUGIN, PROJECTS, Store};
 pub use self::{
     app::{AppHost, Ending},
     worker::WorkerHost,
