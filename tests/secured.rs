@@ -50,8 +50,19 @@ impl SecuredFarm {
         assert_eq!(mode & 0o777, 0o600, "the identity is its owner's alone");
     }
 
+    /// Of somebody who joins a project.
+    fn join_project(&self, name: &str, project: &str) {
+        let token = stdout(&self.as_who("operator", &["token", "create", "app", "--project", project]));
+        let joined = self.as_who(name, &["join", token.trim(), "--name", name]);
+        assert!(joined.status.success(), "{joined:?}");
+    }
+
     fn worker(&self, flags: &[&str]) -> Process {
-        let common = ["--coordinator", &self.grpc, "--device", "sim", "--connect-timeout", "5s"];
+        self.worker_on("sim", flags)
+    }
+
+    fn worker_on(&self, device: &str, flags: &[&str]) -> Process {
+        let common = ["--coordinator", &self.grpc, "--device", device, "--connect-timeout", "5s"];
         Process::start("farm-worker", common.iter().chain(flags))
     }
 }
@@ -195,4 +206,76 @@ fn s06_a_full_disk_under_the_control_store_refuses_changes_and_nothing_else() {
     };
     assert!(ended.success(), "{words}");
     assert!(!words.contains("the coordinator is lost"), "its session stood:\n{words}");
+}
+
+/// Issue 6, quotas by project, as an operator and an artist see them.
+#[test]
+fn a_project_has_what_its_quota_says() {
+    let farm = SecuredFarm::start();
+    let as_operator = |arguments: &[&str]| farm.as_who("operator", arguments);
+    let _workers: Vec<Process> = ["gpu-1", "gpu-2"]
+        .into_iter()
+        .map(|name| {
+            farm.join("node", name);
+            let mut worker = farm.worker_on("cpu", &["--identity", text(&farm.file(name))]);
+            assert_eq!(worker.next_json()["event"], "ready");
+            worker
+        })
+        .collect();
+    let set =
+        as_operator(&["project", "set", "films", "--devices", "1", "--queued-jobs", "3", "--bytes", "1GiB"]);
+    assert_eq!(stdout(&set), "films may have 1 device, 3 queued jobs, 1.0 GiB\n", "{set:?}");
+    farm.join_project("artist", "films");
+    let members = stdout(&as_operator(&["member", "ls"]));
+    assert!(members.contains("gleaner://studio/app/artist  films\n"), "{members}");
+
+    let path = |name: &str| farm.folder.path().join(name).display().to_string();
+    let (scene, image) = (path("cornell"), path("image.exr"));
+    assert!(farmctl(["scene", "cornell-box", &scene]).status.success());
+    let render = ["render", &scene, "-o", &image, "--size", "128x96", "--spp", "4"];
+    let done = farm.as_who("artist", &render);
+    assert!(done.status.success(), "{}", stderr(&done));
+    let timeline = farm.as_who("artist", &["timeline", "-o", "json"]);
+    let timeline: serde_json::Value = serde_json::from_slice(&timeline.stdout).unwrap();
+    let segments = timeline["segments"].as_array().unwrap();
+    let mut spans: Vec<(u64, u64, u64)> = segments
+        .iter()
+        .map(|segment| {
+            ["scheduled_at", "ended_at", "node"].map(|field| segment[field].as_u64().unwrap()).into()
+        })
+        .collect();
+    spans.sort_unstable();
+    assert!(spans.len() > 3, "{timeline}");
+    for (scheduled_at, _, node) in &spans {
+        let at_once = spans.iter().filter(|(from, to, _)| from <= scheduled_at && scheduled_at < to);
+        let (mut jobs, mut elsewhere) = (0, 0);
+        at_once.for_each(|(_, _, other)| {
+            jobs += 1;
+            elsewhere += u32::from(other != node);
+        });
+        assert!(
+            jobs <= 3 && elsewhere == 0,
+            "{jobs} jobs, {elsewhere} of them on another device: {timeline}"
+        );
+    }
+
+    let set = as_operator(&["project", "set", "films", "--bytes", "1kB", "--devices", "none"]);
+    assert_eq!(stdout(&set), "films may have 3 queued jobs, 1000 B\n", "{set:?}");
+    let refused = farm.as_who("artist", &render);
+    assert_eq!(refused.status.code(), Some(1), "{refused:?}");
+    assert!(stderr(&refused).contains("project films may have 1000 B"), "{}", stderr(&refused));
+    let audit = fs::read_to_string(farm.folder.path().join("state/audit.ndjson")).unwrap();
+    assert!(audit.contains("project films may have 1000 B"), "{audit}");
+
+    let listed = stdout(&as_operator(&["project", "ls"]));
+    assert!(listed.contains("default") && listed.contains("0 B of 1000 B"), "{listed}");
+    let denied = farm.as_who("artist", &["project", "set", "films", "--bytes", "none"]);
+    assert_eq!(denied.status.code(), Some(4), "{denied:?}");
+    let removed = as_operator(&["project", "rm", "films"]);
+    assert_eq!(removed.status.code(), Some(4), "somebody belongs to it: {removed:?}");
+    assert!(as_operator(&["member", "expel", "gleaner://studio/app/artist"]).status.success());
+    assert!(as_operator(&["project", "rm", "films"]).status.success());
+    let slip = as_operator(&["token", "create", "app", "--project", "films"]);
+    assert_eq!(slip.status.code(), Some(4), "{slip:?}");
+    assert!(stderr(&slip).contains("farmctl project set films"), "{}", stderr(&slip));
 }

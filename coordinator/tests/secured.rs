@@ -7,13 +7,15 @@ use std::{fs, time::Duration};
 
 use coordinator::{CoordinatorHandle, CoordinatorOptions, initialise, start};
 use farm_core::{
-    coordinator::timeline::TimelineQuery,
-    device::{DeviceInfo, DeviceKind, Features, Limits},
-    id::{AppId, AppIncarnation, NodeId, NodeSession},
+    coordinator::{AppStatus, timeline::TimelineQuery},
+    device::{DeviceInfo, DeviceKind, Features, Limits, Requirements},
+    id::{AppId, AppIncarnation, BatchId, ContentHash, JobIndex, NodeId, NodeSession, TaskId},
     message::{
-        AppHello, AppToCoordinator, Contact, CoordinatorToApp, CoordinatorToNode, NodeHello,
-        NodeToCoordinator, PROTOCOL_VERSION,
+        AppHello, AppToCoordinator, Contact, CoordinatorToApp, CoordinatorToNode, CostNs, JobFailure,
+        NodeHello, NodeToCoordinator, PROTOCOL_VERSION, PlanJob, PlanRequest,
     },
+    program::Content,
+    project::QuotaChange,
 };
 use proto::{
     control::{self, Invitation, Session, SessionError},
@@ -84,12 +86,21 @@ async fn each_role_may_do_what_the_matrix_says_and_nothing_else() {
     let farm = Farm::start().await;
     let address = farm.address.as_str();
     // What each may: see the farm, the timeline, drain, make tokens, list tokens, take one back, list members, expel, bring jobs,
-    // give devices, renew.
-    let matrix: [(Option<&Identity>, [bool; 11]); 4] = [
-        (Some(&farm.operator), [true, true, true, true, true, true, true, true, true, false, true]),
-        (Some(&farm.app), [true, true, false, false, false, false, false, false, true, false, true]),
-        (Some(&farm.node), [false, false, false, false, false, false, false, false, false, true, true]),
-        (None, [false; 11]),
+    // set up a project, remove one, give devices, renew.
+    let matrix: [(Option<&Identity>, [bool; 13]); 4] = [
+        (
+            Some(&farm.operator),
+            [true, true, true, true, true, true, true, true, true, true, true, false, true],
+        ),
+        (
+            Some(&farm.app),
+            [true, true, false, false, false, false, false, false, true, false, false, false, true],
+        ),
+        (
+            Some(&farm.node),
+            [false, false, false, false, false, false, false, false, false, false, false, true, true],
+        ),
+        (None, [false; 13]),
     ];
     let before = control::status(address, Some(&farm.operator)).await.unwrap();
     for (who, allowed) in matrix {
@@ -110,6 +121,8 @@ async fn each_role_may_do_what_the_matrix_says_and_nothing_else() {
             is_denied(control::list_members(address, who).await),
             is_denied(control::expel(address, who, "gleaner://farm/app/nobody").await),
             is_denied(control::connect_app(address, who, &[]).await),
+            is_denied(control::set_project(address, who, "default", QuotaChange::default()).await),
+            is_denied(control::remove_project(address, who, "nonesuch").await),
             is_denied(control::connect_node(address, who).await),
             is_denied(renewed),
         ];
@@ -221,6 +234,99 @@ fn app_hello(resume: Option<(AppId, AppIncarnation)>) -> AppToCoordinator {
     })
 }
 
+/// Who belongs to a project is of it in each life of the coordinator, and its quota counts in each.
+#[tokio::test(flavor = "multi_thread")]
+async fn a_member_is_of_its_tokens_project_and_the_quota_outlives_the_coordinator() {
+    let farm = Farm::start().await;
+    let operator = Some(&farm.operator);
+    let films = Invitation { project: Some("films".to_owned()), ..invitation(Role::App, None) };
+    let refused = control::create_token(&farm.address, operator, &films).await;
+    assert!(is_denied(refused), "a slip in a name makes no project");
+    let change = QuotaChange { bytes: Some(Some(100)), weight: Some(Some(0.5)), ..QuotaChange::default() };
+    let quota = control::set_project(&farm.address, operator, "films", change).await.unwrap();
+    assert_eq!((quota.bytes, quota.weight, quota.devices), (Some(100), Some(0.5), None));
+    let of_a_node = Invitation { role: Role::Node, ..films.clone() };
+    let refused = control::create_token(&farm.address, operator, &of_a_node).await;
+    assert!(matches!(refused, Err(SessionError::Refused { .. })), "{refused:?}");
+    let bad = QuotaChange { weight: Some(Some(f64::NAN)), ..QuotaChange::default() };
+    let refused = control::set_project(&farm.address, operator, "films", bad).await;
+    assert!(matches!(refused, Err(SessionError::Refused { .. })), "{refused:?}");
+
+    let token = token(&farm.address, &farm.operator, &films).await;
+    let artist = control::join(&farm.address, &token, Some("artist")).await.unwrap();
+    let in_use = control::remove_project(&farm.address, operator, "films").await;
+    let says_who = matches!(&in_use, Err(SessionError::Denied { reason }) if reason.contains("app/artist"));
+    assert!(says_who, "{in_use:?}");
+    let (session, who, given) = app(&farm.address, &artist, None, &[]).await.unwrap();
+    let (_other, ..) = app(&farm.address, &farm.app, None, &[]).await.unwrap();
+    let projects = async |address: &str, operator: &Identity| {
+        let status = control::status(address, Some(operator)).await.unwrap();
+        let of = |app: AppStatus| (app.project, app.weight);
+        status.apps.into_iter().map(of).collect::<Vec<_>>()
+    };
+    let of_films = ("films".to_owned(), 0.5);
+    let both = [of_films.clone(), ("default".to_owned(), 1.0)];
+    assert_eq!(projects(&farm.address, &farm.operator).await, both);
+
+    let Farm { state, handle, operator, .. } = farm;
+    drop(session);
+    handle.shutdown().await;
+    let handle = Farm::coordinator(&state).await;
+    let address = handle.grpc_addr().to_string();
+    let (mut session, ..) = app(&address, &artist, Some(who), &given).await.unwrap();
+    assert_eq!(projects(&address, &operator).await, [of_films]);
+
+    // A node, so that there is something to be refused.
+    let node = join(&address, &operator, Role::Node, "m").await;
+    let mut node = control::connect_node(&address, Some(&node)).await.unwrap();
+    node.sender.try_send(node_hello("m")).unwrap();
+    assert!(matches!(node.receiver.recv().await, Ok(CoordinatorToNode::Welcome { .. })));
+    let heard = node.receiver.recv().await.unwrap();
+    let CoordinatorToNode::AppJoined { terms, .. } = heard else { panic!("{heard:?}") };
+    assert_eq!((terms.project.as_str(), terms.weight, terms.result_bytes), ("films", 0.5, Some(100)));
+    let content = Content { hash: ContentHash([7; 32]), size_bytes: 101 };
+    let request = PlanRequest {
+        batch: BatchId(1),
+        task: TaskId(0),
+        jobs: (0..3).map(|index| PlanJob { index: JobIndex(index), cost: CostNs(1) }).collect(),
+        needs: Requirements::ANY,
+        module: None,
+        contents: vec![content],
+        held: Vec::new(),
+    };
+    session.sender.try_send(AppToCoordinator::Plan(request)).unwrap();
+    for _ in 0..3 {
+        let heard = session.receiver.recv().await.unwrap();
+        let over = matches!(&heard, CoordinatorToApp::JobFailed { failure: JobFailure::OverQuota(_), .. });
+        assert!(over, "{heard:?}");
+    }
+    let audit = fs::read_to_string(state.path().join("audit.ndjson")).unwrap();
+    let refusals =
+        audit.lines().filter(|line| line.contains("\"refused\"") && line.contains("101 B")).count();
+    assert_eq!(refusals, 1, "once for the batch:\n{audit}");
+    assert!(audit.contains("\"project set\""), "{audit}");
+    handle.shutdown().await;
+}
+
+fn node_hello(name: &str) -> NodeToCoordinator {
+    let device = DeviceInfo {
+        name: "simulated".to_owned(),
+        kind: DeviceKind::Simulated,
+        score: 1_000.0,
+        features: Features::default(),
+        limits: Limits::UNBOUNDED,
+    };
+    NodeToCoordinator::Hello(NodeHello {
+        protocol: PROTOCOL_VERSION,
+        node: None,
+        name: name.to_owned(),
+        session: NodeSession(77),
+        devices: vec![device],
+        contact: Contact { addresses: vec!["127.0.0.1:9".to_owned()], certificate_der: vec![1, 2, 3] },
+        inventory: Vec::new(),
+    })
+}
+
 type AppSession = Session<AppToCoordinator, CoordinatorToApp>;
 type Who = (AppId, AppIncarnation);
 
@@ -320,23 +426,7 @@ async fn a_node_has_the_name_of_its_identity() {
     let farm = Farm::start().await;
     let register = async |name: &str| {
         let mut session = control::connect_node(&farm.address, Some(&farm.node)).await.unwrap();
-        let device = DeviceInfo {
-            name: "simulated".to_owned(),
-            kind: DeviceKind::Simulated,
-            score: 1_000.0,
-            features: Features::default(),
-            limits: Limits::UNBOUNDED,
-        };
-        let hello = NodeToCoordinator::Hello(NodeHello {
-            protocol: PROTOCOL_VERSION,
-            node: None,
-            name: name.to_owned(),
-            session: NodeSession(77),
-            devices: vec![device],
-            contact: Contact { addresses: vec!["127.0.0.1:9".to_owned()], certificate_der: vec![1, 2, 3] },
-            inventory: Vec::new(),
-        });
-        session.sender.try_send(hello).unwrap();
+        session.sender.try_send(node_hello(name)).unwrap();
         session.receiver.recv().await
     };
     assert!(is_denied(register("somebody-else").await));

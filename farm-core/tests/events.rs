@@ -290,7 +290,7 @@ fn worker_event(step: Step) -> worker::Event {
         21 => worker::Event::FromCoordinator(CoordinatorToNode::AppJoined {
             app: AppId(u64::from(step.one) % 2),
             terms: AppTerms {
-                project: ["a", "b"][usize::from(step.three % 2 == 0)].to_owned(),
+                project: ["a", "b"][usize::from(step.three.is_multiple_of(2))].to_owned(),
                 result_bytes: (step.four > 0).then_some(u64::from(step.four) * 8),
                 stays: step.four == 2,
                 ..AppTerms::unlimited(f64::from(step.two) + 0.5)

@@ -9,7 +9,7 @@ use super::{
     CoordinatorMachine, ProjectStatus,
     model::{JobState, Pending, Placement},
     neighbours::Place,
-    policy::{Question, QuestionDevice},
+    policy::{Question, QuestionDevice, QuestionJob},
 };
 use crate::{
     id::{AppId, ContentHash, JobId, JobKey, LinkId, NodeId},
@@ -309,10 +309,8 @@ impl CoordinatorMachine {
         if quota == (Quota { weight: quota.weight, ..Quota::default() }) {
             return Some(question);
         }
-        let keys_of = |question: &Question| {
-            question.jobs.iter().map(|job| JobKey { task: question.task, index: job.index }).collect()
-        };
-        pending.keys = keys_of(&question);
+        let key = |job: &QuestionJob| JobKey { task: question.task, index: job.index };
+        pending.keys = question.jobs.iter().map(key).collect();
         if let Some(most) = quota.bytes {
             match self.bytes_fit(pending, most) {
                 Fits::Now => {}

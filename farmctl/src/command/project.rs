@@ -64,10 +64,14 @@ fn table(projects: &[ProjectStatus]) -> String {
     format!("{table}\n")
 }
 
+fn counted(count: u64, what: &str) -> String {
+    if count == 1 { format!("1 {what}") } else { format!("{count} {what}s") }
+}
+
 fn words(quota: &Quota) -> String {
     let bounds: Vec<String> = [
-        quota.devices.map(|most| format!("{most} devices")),
-        quota.queued_jobs.map(|most| format!("{most} queued jobs")),
+        quota.devices.map(|most| counted(most.into(), "device")),
+        quota.queued_jobs.map(|most| counted(most, "queued job")),
         quota.bytes.map(size),
         quota.weight.map(|most| format!("a weight of {most}")),
     ]
@@ -99,6 +103,7 @@ mod tests {
             assert!(table.contains(said), "{said}: {table}");
         }
         assert_eq!(words(&quota), "4 devices, 1.0 GiB");
+        assert_eq!(words(&Quota { queued_jobs: Some(1), ..Quota::default() }), "1 queued job");
         assert_eq!(words(&Quota::default()), "as much as there is");
     }
 }
