@@ -136,8 +136,9 @@ impl CoordinatorMachine {
             assert!(waits, "I1: {} of {} has jobs held back, and nothing to wait for", id.1, id.0);
             assert_eq!(*id, (pending.app, pending.batch), "I8: what is held back is of another batch");
         }
-        let lines = self.stuck.iter().chain(&self.over_quota);
-        for pending in lines.chain(asked).chain(self.reserved.values()) {
+        for pending in
+            self.stuck.iter().chain(self.projects.lines()).chain(asked).chain(self.reserved.values())
+        {
             let Some(app) = self.apps.get(&pending.app) else {
                 panic!("I8: jobs of {}, which left, are in line", pending.app)
             };

@@ -367,9 +367,8 @@ pub struct CoordinatorMachine {
     fresh: VecDeque<Pending>,
     /// Jobs that no device can take now, first come, first served; tried again when that may have changed.
     stuck: VecDeque<Pending>,
+    /// With the jobs that wait because theirs has as much as it may.
     projects: Projects,
-    /// Jobs whose projects have as much as they may, first come, first served; tried again when one has less.
-    over_quota: VecDeque<Pending>,
     /// Jobs that are held back until those before them have nearly ended: of the policy `neighbours`.
     reserved: BTreeMap<(AppId, BatchId), Pending>,
     /// Batches that a plug-in was asked about.
@@ -420,7 +419,6 @@ impl CoordinatorMachine {
             history: History::default(),
             fresh: VecDeque::new(),
             stuck: VecDeque::new(),
-            over_quota: VecDeque::new(),
             reserved: BTreeMap::new(),
             questions: BTreeMap::new(),
             next_question: 1,

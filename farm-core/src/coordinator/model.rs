@@ -121,7 +121,7 @@ pub(super) struct Job {
 /// Where a job is, as far as the coordinator knows.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum JobState {
-    /// In `fresh`, `stuck`, `over_quota`, `lost` or `reserved`.
+    /// In `fresh`, `stuck`, `lost`, `reserved` or its project's line.
     Waiting,
     /// Planned; in transit, queued or running.
     Placed(Placement),

@@ -76,14 +76,15 @@ impl CoordinatorMachine {
 
     /// Places what the current event brought up; what finds no device waits in `stuck`.
     pub(super) fn place_pending(&mut self, now: Instant) {
+        self.serve_lines(now);
         // Jobs that lost their place came before anything that is new.
         for ((app, batch), keys) in std::mem::take(&mut self.lost).into_iter().rev() {
             self.fresh.push_front(Pending { app, batch, answers: None, keys });
         }
-        loop {
-            self.retry_relieved();
-            let Some(pending) = self.fresh.pop_front() else { return };
-            self.place_batch(now, pending);
+        while let Some(mut pending) = self.fresh.pop_front() {
+            if pending.answers.is_none() || !self.waits_in_line(&mut pending) {
+                self.place_batch(now, pending);
+            }
         }
     }
 
@@ -97,14 +98,14 @@ impl CoordinatorMachine {
     pub(super) fn forget_pending(&mut self, gone: impl Fn(&Pending) -> bool) {
         self.fresh.retain(|pending| !gone(pending));
         self.stuck.retain(|pending| !gone(pending));
-        self.over_quota.retain(|pending| !gone(pending));
+        self.projects.lines_mut().for_each(|line| line.retain(|pending| !gone(pending)));
         self.reserved.retain(|_, pending| !gone(pending));
         self.questions.retain(|_, asked| !gone(&asked.pending));
     }
 
     /// Takes the jobs of a task out of line.
     pub(super) fn forget_waiting(&mut self, id: AppId, task: TaskId) {
-        for queue in [&mut self.fresh, &mut self.stuck, &mut self.over_quota] {
+        for queue in [&mut self.fresh, &mut self.stuck].into_iter().chain(self.projects.lines_mut()) {
             for pending in queue.iter_mut().filter(|pending| pending.app == id) {
                 pending.keys.retain(|key| key.task != task);
             }
@@ -148,7 +149,7 @@ impl CoordinatorMachine {
         }
     }
 
-    fn place_batch(&mut self, now: Instant, pending: Pending) {
+    pub(super) fn place_batch(&mut self, now: Instant, pending: Pending) {
         let estimates = self.learn(&pending);
         let Some((pending, mut question)) = self.question(now, pending) else { return };
         let Some(app) = self.apps.get(&pending.app) else { return };
@@ -183,7 +184,7 @@ impl CoordinatorMachine {
         }
     }
 
-    /// What is to be decided for a batch. `None` if nothing is: its jobs are gone, or wait in `stuck` or `over_quota`.
+    /// What is to be decided for a batch. `None` if nothing is: its jobs are gone, or wait in `stuck` or for their project.
     fn question(&mut self, now: Instant, mut pending: Pending) -> Option<(Pending, Question)> {
         let app = self.apps.get(&pending.app)?;
         let batch = app.batches.get(&pending.batch)?;
@@ -354,7 +355,7 @@ impl CoordinatorMachine {
         if !self.apps.get(&id).is_some_and(|app| app.batches.contains_key(&batch)) {
             return keys;
         }
-        for queue in [&mut self.fresh, &mut self.stuck, &mut self.over_quota] {
+        for queue in [&mut self.fresh, &mut self.stuck].into_iter().chain(self.projects.lines_mut()) {
             queue.retain_mut(|pending| {
                 let asked = pending.app == id && pending.batch == batch;
                 if asked {

@@ -1,9 +1,9 @@
 //! What the applications of a project have together, and may have: devices, planned jobs, bytes, fair-share weight.
 //!
-//! What is over a quota waits in `over_quota` until the project has less; nothing is lost. Only a batch that alone needs more
-//! bytes than its project may have fails.
+//! What is over a quota waits in its project's line until the project has less, first come, first served; nothing is lost. Only a
+//! batch that alone needs more bytes than its project may have fails.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
 use super::{
     CoordinatorMachine, ProjectStatus,
@@ -16,6 +16,7 @@ use crate::{
     message::{CoordinatorToNode, JobFailure, WaitReason},
     program::Content,
     project::{AppTerms, DEFAULT_PROJECT, Quota},
+    time::Instant,
 };
 
 /// A project, for as long as an application of it is registered.
@@ -28,7 +29,7 @@ pub(super) struct Projects {
     by_name: BTreeMap<String, Slot>,
     next: Slot,
     of: BTreeMap<AppId, Slot>,
-    /// Have less than they had, since the last look at what waits.
+    /// Have less than they had, since the last look at their lines.
     relieved: BTreeSet<Slot>,
     /// Whose the connection is on which a hello comes next.
     introduced: Option<(LinkId, String)>,
@@ -45,6 +46,8 @@ struct Project {
     /// Size in bytes of each content, and the batches that name it.
     contents: BTreeMap<ContentHash, (u64, u32)>,
     content_bytes: u64,
+    /// Jobs that wait until it has less.
+    line: VecDeque<Pending>,
 }
 
 impl Project {
@@ -158,6 +161,25 @@ impl Projects {
         self.relieved.insert(slot);
     }
 
+    /// Jobs that wait for their project, in the order that each project's will go on.
+    pub(super) fn lines(&self) -> impl Iterator<Item = &Pending> {
+        self.projects.values().flat_map(|project| &project.line)
+    }
+
+    pub(super) fn lines_mut(&mut self) -> impl Iterator<Item = &mut VecDeque<Pending>> {
+        self.projects.values_mut().map(|project| &mut project.line)
+    }
+
+    /// Puts jobs into line: behind those of the project that wait already, or before them.
+    fn line_up(&mut self, pending: Pending, first: bool) {
+        let Some((_, project)) = self.project_of_mut(pending.app) else { return };
+        if first {
+            project.line.push_front(pending);
+        } else {
+            project.line.push_back(pending);
+        }
+    }
+
     fn named(&mut self, name: &str) -> Slot {
         if let Some(&slot) = self.by_name.get(name) {
             return slot;
@@ -172,6 +194,7 @@ impl Projects {
             devices: BTreeMap::new(),
             contents: BTreeMap::new(),
             content_bytes: 0,
+            line: VecDeque::new(),
         };
         self.projects.insert(slot, project);
         slot
@@ -286,20 +309,33 @@ impl CoordinatorMachine {
         }
     }
 
-    /// Puts what waits of relieved projects back into line.
-    pub(super) fn retry_relieved(&mut self) {
-        if self.projects.relieved.is_empty() {
-            return;
+    /// Places what waits of relieved projects, as far as these may have it.
+    pub(super) fn serve_lines(&mut self, now: Instant) {
+        while let Some(slot) = self.projects.relieved.pop_first() {
+            let line = |machine: &mut Self| {
+                let project = machine.projects.projects.get_mut(&slot)?;
+                Some((project.line.len(), project.line.pop_front()?))
+            };
+            while let Some((waited, pending)) = line(self) {
+                self.place_batch(now, pending);
+                // The first one is there again, or what is left of it: those behind it wait for it.
+                if self.projects.projects.get(&slot).is_some_and(|project| project.line.len() >= waited) {
+                    break;
+                }
+            }
         }
-        let relieved = std::mem::take(&mut self.projects.relieved);
-        let is_relieved =
-            |pending: &Pending| self.projects.of.get(&pending.app).is_none_or(|slot| relieved.contains(slot));
-        let (again, waits): (Vec<_>, Vec<_>) =
-            std::mem::take(&mut self.over_quota).into_iter().partition(is_relieved);
-        self.over_quota = waits.into();
-        for pending in again.into_iter().rev() {
-            self.fresh.push_front(pending);
+    }
+
+    /// Whether new jobs of an application have to wait behind others of its project. Then they do, unless there is nothing to
+    /// wait for.
+    pub(super) fn waits_in_line(&mut self, pending: &mut Pending) -> bool {
+        let Some(project) = self.projects.project_of(pending.app) else { return false };
+        let fails = |most| matches!(self.bytes_fit(pending, most), Fits::Never(_));
+        let waits = !project.line.is_empty() && !project.quota.bytes.is_some_and(fails);
+        if waits {
+            self.wait_for_project(pending, false);
         }
+        waits
     }
 
     /// Reduces what is to be decided to what the application's project may have now; the other jobs wait. `None`: all do, or
@@ -314,7 +350,7 @@ impl CoordinatorMachine {
         if let Some(most) = quota.bytes {
             match self.bytes_fit(pending, most) {
                 Fits::Now => {}
-                Fits::Later => return self.wait_for_project(pending),
+                Fits::Later => return self.wait_first(pending),
                 Fits::Never(reason) => {
                     for key in std::mem::take(&mut pending.keys) {
                         self.fail_job(key.in_app(pending.app), JobFailure::OverQuota(reason.clone()));
@@ -326,19 +362,19 @@ impl CoordinatorMachine {
         if let Some(most) = quota.devices {
             question.devices = self.permitted(pending.app, most, &question);
             if question.devices.is_empty() {
-                return self.wait_for_project(pending);
+                return self.wait_first(pending);
             }
         }
         if let Some(most) = quota.queued_jobs {
             let room = usize::try_from(most.saturating_sub(self.planned_of_project(pending.app)));
             let room = room.unwrap_or(usize::MAX);
             if room == 0 {
-                return self.wait_for_project(pending);
+                return self.wait_first(pending);
             }
             if room < question.jobs.len() {
                 question.jobs.truncate(room);
                 let keys = pending.keys.split_off(room);
-                self.over_quota.push_back(Pending { keys, ..*pending });
+                self.projects.line_up(Pending { keys, ..*pending }, true);
             }
         }
         Some(question)
@@ -378,11 +414,16 @@ impl CoordinatorMachine {
             .collect()
     }
 
-    fn wait_for_project(&mut self, pending: &mut Pending) -> Option<Question> {
+    /// What was about to be placed is the next to be.
+    fn wait_first(&mut self, pending: &mut Pending) -> Option<Question> {
+        self.wait_for_project(pending, true);
+        None
+    }
+
+    fn wait_for_project(&mut self, pending: &mut Pending, first: bool) {
         self.say_waiting(pending.app, pending.batch, WaitReason::OverQuota);
         let keys = std::mem::take(&mut pending.keys);
-        self.over_quota.push_back(Pending { keys, ..*pending });
-        None
+        self.projects.line_up(Pending { keys, ..*pending }, first);
     }
 
     fn bytes_fit(&self, pending: &Pending, most: u64) -> Fits {

@@ -116,6 +116,28 @@ fn task_data_waits_for_room_and_what_can_never_fit_fails() {
 }
 
 #[test]
+fn a_large_batch_in_line_is_not_passed_by_small_ones() {
+    let mut farm = limited(&[1_000.0], Quota { bytes: Some(100), ..Quota::default() });
+    let content = |tag, size_bytes| Content { hash: ContentHash([tag; 32]), size_bytes };
+    let first = farm.plan(&[10], 1, &[content(1, 60)]);
+    let mut later: Vec<usize> = Vec::new();
+    for size_bytes in [90, 10, 10] {
+        let tag = u8::try_from(10 + later.len()).unwrap();
+        later.push(total(&farm.plan(&[10; 2], 1, &[content(tag, size_bytes)])));
+    }
+    assert_eq!(later, [0, 0, 0], "the small ones would fit, and wait their turn");
+    let next = farm.ended(1, first[&1][0], 10);
+    assert_eq!(
+        (total(&next), project(&farm).bytes),
+        (4, 100),
+        "the large one and the first of the small ones"
+    );
+    let of_large = next[&1].clone();
+    assert_eq!(total(&farm.ended(1, of_large[0], 10)), 0);
+    assert_eq!(total(&farm.ended(1, of_large[1], 10)), 2, "all are through");
+}
+
+#[test]
 fn weights_of_a_project_come_to_no_more_than_its_quota() {
     let mut farm = Farm::new("", &[1_000.0]);
     set(&mut farm, "films", Quota { weight: Some(3.0), ..Quota::default() });
