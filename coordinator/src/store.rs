@@ -222,6 +222,7 @@ impl Store {
             self.tokens(0)?;
             self.members()?;
             self.quotas()?;
+            self.belonging()?;
             self.restored()?;
             self.read(|transaction| {
                 let numbers = transaction.open_table(NUMBERS).map_err(broken)?;

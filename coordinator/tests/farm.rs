@@ -100,7 +100,7 @@ async fn an_app_and_a_node_meet_through_sessions() {
     let welcome = node.receiver.recv().await.unwrap();
     let CoordinatorToNode::Welcome { node: id, .. } = welcome else { panic!("got {welcome:?}") };
     let joined = node.receiver.recv().await.unwrap();
-    assert!(matches!(joined, CoordinatorToNode::AppJoined { .. }), "got {joined:?}");
+    assert!(matches!(joined, CoordinatorToNode::AppsJoined(_)), "got {joined:?}");
     let plan = app.receiver.recv().await.unwrap();
     let CoordinatorToApp::Plan(plan) = plan else { panic!("got {plan:?}") };
     assert_eq!(plan.nodes.len(), 1);

@@ -282,7 +282,8 @@ async fn a_member_is_of_its_tokens_project_and_the_quota_outlives_the_coordinato
     node.sender.try_send(node_hello("m")).unwrap();
     assert!(matches!(node.receiver.recv().await, Ok(CoordinatorToNode::Welcome { .. })));
     let heard = node.receiver.recv().await.unwrap();
-    let CoordinatorToNode::AppJoined { terms, .. } = heard else { panic!("{heard:?}") };
+    let CoordinatorToNode::AppsJoined(apps) = heard else { panic!("{heard:?}") };
+    let (_, terms) = &apps[0];
     assert_eq!((terms.project.as_str(), terms.weight, terms.result_bytes), ("films", 0.5, Some(100)));
     let content = Content { hash: ContentHash([7; 32]), size_bytes: 101 };
     let request = PlanRequest {

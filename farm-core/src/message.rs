@@ -491,13 +491,8 @@ pub enum CoordinatorToNode {
         /// Why, for people.
         reason: String,
     },
-    /// An application may send jobs.
-    AppJoined {
-        /// Which.
-        app: AppId,
-        /// What it may have; said again when that changes.
-        terms: AppTerms,
-    },
+    /// Applications may send jobs, and what each may have; said again of those of which that changes.
+    AppsJoined(Vec<(AppId, AppTerms)>),
     /// Everything of this application can be freed.
     AppLeft {
         /// Which.

@@ -287,15 +287,16 @@ fn worker_event(step: Step) -> worker::Event {
         20 if step.four == 1 => worker::Event::SpoolFull(step.one.is_multiple_of(2)),
         20 if step.four == 2 => worker::Event::ResultLost(job(step)),
         20 if step.four == 0 => worker::Event::DeviceLost { device, reason: "test".to_owned() },
-        21 => worker::Event::FromCoordinator(CoordinatorToNode::AppJoined {
-            app: AppId(u64::from(step.one) % 2),
-            terms: AppTerms {
+        21 => {
+            let terms = AppTerms {
                 project: ["a", "b"][usize::from(step.three.is_multiple_of(2))].to_owned(),
-                result_bytes: (step.four > 0).then_some(u64::from(step.four) * 8),
+                result_bytes: step.four.checked_sub(1).map(|most| u64::from(most) * 8),
                 stays: step.four == 2,
                 ..AppTerms::unlimited(f64::from(step.two) + 0.5)
-            },
-        }),
+            };
+            let apps = vec![(AppId(u64::from(step.one) % 2), terms)];
+            worker::Event::FromCoordinator(CoordinatorToNode::AppsJoined(apps))
+        }
         22 if step.four < 2 => {
             worker::Event::FromCoordinator(CoordinatorToNode::AppLeft { app: AppId(u64::from(step.one) % 2) })
         }

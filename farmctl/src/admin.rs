@@ -114,7 +114,7 @@ impl Admin {
     /// Removes a project that nobody belongs to.
     pub(crate) async fn remove_project(&self, project: &str) -> Result<(), Failure> {
         let (address, identity) = self.to();
-        control::remove_project(address, identity, project).await.map_err(usage)
+        control::remove_project(address, identity, project).await.map_err(failure)
     }
 
     /// Ends a membership.

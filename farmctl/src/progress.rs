@@ -138,12 +138,14 @@ async fn tell_bar(progress: &mut watch::Receiver<Progress>, units: Units) {
 
 /// Without a terminal only what needs a person's help is told, once each.
 async fn tell_waits(progress: &mut watch::Receiver<Progress>) {
-    let mut told = None;
+    let (mut told, mut quota_told) = (None, false);
     loop {
         let waiting = waits(&progress.borrow_and_update());
-        if let Some(reason) = waiting.filter(|_| waiting != told) {
+        let again = waiting == Some(OVER_QUOTA) && quota_told;
+        if let Some(reason) = waiting.filter(|_| waiting != told && !again) {
             tell!("farmctl: waiting: {reason}");
         }
+        quota_told |= waiting == Some(OVER_QUOTA);
         told = waiting;
         if progress.changed().await.is_err() {
             return;
@@ -152,30 +154,38 @@ async fn tell_waits(progress: &mut watch::Receiver<Progress>) {
 }
 
 fn message(now: &Progress, units: &Units, elapsed: Duration) -> String {
-    if let Some(reason) = waits(now) {
+    let waiting = waits(now);
+    let share = (units.share)(now);
+    let computed = now.jobs_done - now.jobs_journalled;
+    let begun = share > 0.0 && computed > 0;
+    // A project at its quota gets on, if more slowly.
+    let slow = begun && waiting == Some(OVER_QUOTA);
+    if let Some(reason) = waiting.filter(|_| !slow) {
         return format!("waiting: {reason}");
     }
     if now.coordinator == CoordinatorLink::Reconnecting {
         return "coordinator lost, trying again; nodes go on working".to_owned();
     }
-    let share = (units.share)(now);
-    let computed = now.jobs_done - now.jobs_journalled;
-    if share <= 0.0 || computed == 0 {
+    if !begun {
         return String::new();
     }
     // What a journal had took no time.
     let computed = share * count(computed) / count(now.jobs_done);
     let rate = units.total * computed / elapsed.as_secs_f64();
     let left = elapsed.mul_f64((1.0 - share).max(0.0) / computed);
-    format!("{} {}/s  ETA {}  nodes {}", HumanCount(whole(rate)), units.name, clock(left), now.nodes)
+    let (rate, left) = (HumanCount(whole(rate)), clock(left));
+    let quota = if slow { "  at your project's quota" } else { "" };
+    format!("{rate} {}/s  ETA {left}  nodes {}{quota}", units.name, now.nodes)
 }
+
+const OVER_QUOTA: &str = "your project has as much of the farm as it may have";
 
 /// Why nothing goes on, if it does not.
 const fn waits(now: &Progress) -> Option<&'static str> {
     match now.waiting {
         Some(WaitReason::NoNode) => Some("no node is registered at the coordinator"),
         Some(WaitReason::NoFittingDevice) => Some("no device of the farm fits the jobs"),
-        Some(WaitReason::OverQuota) => Some("your project has as much of the farm as it may have, waiting"),
+        Some(WaitReason::OverQuota) => Some(OVER_QUOTA),
         None if now.out_of_reach => Some("no node of the farm can be reached from here, trying again"),
         None => None,
     }
@@ -216,6 +226,11 @@ mod tests {
         assert_eq!(message(&now, &units, Duration::from_secs(10)), "25,000 samples/s  ETA 30s  nodes 3");
         let resumed = Progress { jobs_done: 75, jobs_journalled: 50, ..now.clone() };
         assert_eq!(message(&resumed, &units, Duration::from_secs(10)), "25,000 samples/s  ETA 10s  nodes 3");
+        let slow = Progress { waiting: Some(WaitReason::OverQuota), ..now.clone() };
+        assert_eq!(
+            message(&slow, &units, Duration::from_secs(10)),
+            "25,000 samples/s  ETA 30s  nodes 3  at your project's quota"
+        );
         let stuck = Progress { waiting: Some(WaitReason::NoNode), ..now };
         assert!(message(&stuck, &units, Duration::from_secs(10)).contains("no node"));
     }

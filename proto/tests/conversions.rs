@@ -324,12 +324,12 @@ fn coordinator_to_node() -> impl Strategy<Value = CoordinatorToNode> {
         }),
         "\\PC{0,80}".prop_map(|reason| CoordinatorToNode::Refused { reason }),
         Just(CoordinatorToNode::SayInventory),
-        (any::<u64>(), positive(), "\\PC{0,20}", any::<(Option<u64>, bool)>()).prop_map(
-            |(app, weight, project, (result_bytes, stays))| CoordinatorToNode::AppJoined {
-                app: AppId(app),
-                terms: AppTerms { weight, project, result_bytes, stays }
-            }
-        ),
+        vec((any::<u64>(), positive(), "\\PC{0,20}", any::<(Option<u64>, bool)>()), 0..5).prop_map(|apps| {
+            let apps = apps.into_iter().map(|(app, weight, project, (result_bytes, stays))| {
+                (AppId(app), AppTerms { weight, project, result_bytes, stays })
+            });
+            CoordinatorToNode::AppsJoined(apps.collect())
+        }),
         any::<u64>().prop_map(|app| CoordinatorToNode::AppLeft { app: AppId(app) }),
         attempts().prop_map(|jobs| CoordinatorToNode::Cancel { jobs }),
         (any::<u64>(), attempts())

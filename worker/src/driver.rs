@@ -280,7 +280,7 @@ impl Driver {
                     let _ = registered.send(*node);
                 }
             }
-            CoordinatorToNode::AppJoined { .. }
+            CoordinatorToNode::AppsJoined(_)
             | CoordinatorToNode::AppLeft { .. }
             | CoordinatorToNode::Cancel { .. }
             | CoordinatorToNode::Retract { .. }

@@ -44,12 +44,16 @@ struct Waiting {
 }
 
 impl Waiting {
-    /// What the application's own project has in use it will have done with: that is no reason to give up.
     const fn tires(&self) -> bool {
-        match self.reason {
-            WaitReason::NoNode | WaitReason::NoFittingDevice => true,
-            WaitReason::OverQuota => false,
-        }
+        tires(self.reason)
+    }
+}
+
+/// What the application's own project has in use it will have done with: that is no reason to give up.
+const fn tires(reason: WaitReason) -> bool {
+    match reason {
+        WaitReason::NoNode | WaitReason::NoFittingDevice => true,
+        WaitReason::OverQuota => false,
     }
 }
 
@@ -145,6 +149,10 @@ impl Runs {
     /// A batch waits for a device.
     pub(super) fn waits(&mut self, batch: BatchId, task: TaskId, reason: WaitReason, now: Instant) {
         let wait = self.waits.entry(batch).or_insert(Waiting { task, reason, since: now });
+        if wait.tires() != tires(reason) {
+            // Only what tires counts for patience.
+            wait.since = now;
+        }
         wait.reason = reason;
     }
 
@@ -305,6 +313,23 @@ mod tests {
         assert_eq!(runs.waiting(), None);
         drop(runs);
         assert!(matches!(events.try_recv(), Ok(RunEvent::Ended(RunEnd::Farm(FarmError::Closed)))));
+    }
+
+    /// The review of 2026-11-29: a suspended project must not use up the patience for nodes.
+    #[test]
+    fn waiting_for_the_own_project_costs_no_patience() {
+        let mut runs = Runs::new(Duration::from_secs(60));
+        let (sender, events) = mpsc::channel();
+        runs.start(0..1, sender, None);
+        let start = Instant::now();
+        let hour = Duration::from_secs(3_600);
+        runs.waits(BatchId(1), TaskId(0), WaitReason::OverQuota, start);
+        runs.act_on_timers(start + hour);
+        runs.waits(BatchId(1), TaskId(0), WaitReason::NoNode, start + hour);
+        runs.act_on_timers(start + hour + Duration::from_secs(59));
+        assert!(events.try_recv().is_err(), "nodes may be away for a minute");
+        runs.act_on_timers(start + hour + Duration::from_secs(60));
+        assert!(matches!(events.try_recv(), Ok(RunEvent::Ended(RunEnd::NoFittingDevice { .. }))));
     }
 
     #[test]

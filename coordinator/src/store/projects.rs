@@ -20,7 +20,9 @@ impl Store {
         self.write(|transaction| {
             let mut projects = transaction.open_table(PROJECTS).map_err(broken)?;
             let before = projects.get(name).map_err(broken)?.map(|text| quota(text.value())).transpose()?;
-            if before.is_none() && projects.len().map_err(broken)? >= MAX_PROJECTS as u64 {
+            // The one that is always there counts as none.
+            let is_new = before.is_none() && name != DEFAULT_PROJECT;
+            if is_new && projects.len().map_err(broken)? >= MAX_PROJECTS as u64 {
                 return Err(StoreError::Denied(format!("{MAX_PROJECTS} projects are there already")));
             }
             let after = change.apply(before.unwrap_or_default());
@@ -32,7 +34,7 @@ impl Store {
     }
 
     /// Removes a project; whether it was there.
-    pub(crate) fn remove_project(&self, name: &str) -> Result<bool, StoreError> {
+    pub(crate) fn remove_project(&self, name: &str, now_s: u64) -> Result<bool, StoreError> {
         if name == DEFAULT_PROJECT {
             let reason = "the project default stays; `farmctl project set default` lifts its bounds";
             return Err(StoreError::Denied(reason.to_owned()));
@@ -47,7 +49,7 @@ impl Store {
             }
             for entry in transaction.open_table(TOKENS).map_err(broken)?.iter().map_err(broken)? {
                 let token = parse(entry.map_err(broken)?.1.value())?;
-                if token.project == name {
+                if token.project == name && token.expires_s > now_s {
                     let id = token.id;
                     return Err(StoreError::Denied(format!("token {id} is for the project {name}")));
                 }
@@ -170,12 +172,11 @@ mod tests {
         assert!(refused.to_string().contains("farmctl project set films"), "{refused}");
         store.set_project("films", QuotaChange::default()).unwrap();
         let id = store.add_token(b"secret", token("films"), 0).unwrap();
-        let refused = store.remove_project("films").unwrap_err();
+        let refused = store.remove_project("films", 99).unwrap_err();
         assert!(refused.to_string().contains(&format!("token {id}")), "{refused}");
-        assert!(store.remove_token(id).unwrap());
-        assert!(store.remove_project("films").unwrap());
-        assert!(!store.remove_project("films").unwrap(), "once");
-        assert!(store.remove_project(DEFAULT_PROJECT).is_err(), "that one stays");
+        assert!(store.remove_project("films", 100).unwrap(), "a token that is over is none");
+        assert!(!store.remove_project("films", 100).unwrap(), "once");
+        assert!(store.remove_project(DEFAULT_PROJECT, 100).is_err(), "that one stays");
     }
 
     #[test]
@@ -192,6 +193,8 @@ mod tests {
             })
             .unwrap();
         assert!(store.set_project("one-more", QuotaChange::default()).is_err());
-        store.set_project("0", QuotaChange::default()).unwrap();
+        for there in ["0", DEFAULT_PROJECT] {
+            store.set_project(there, QuotaChange::default()).unwrap();
+        }
     }
 }

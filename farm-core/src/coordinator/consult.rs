@@ -96,7 +96,7 @@ impl CoordinatorMachine {
         });
         let devices = chosen.iter().map(|&position| &question.devices[position as usize]);
         let devices = devices.map(|device| (device.node, device.device)).collect();
-        let within = self.is_within_quota(pending.app, choices.len(), &devices);
+        let within = self.is_within_quota(&pending, choices.len(), &devices);
         let Some(app) = self.apps.get(&pending.app) else { return };
         if !stands || !within || app.link.is_none() {
             self.fresh.push_back(pending);

@@ -93,6 +93,7 @@ impl CoordinatorMachine {
         while let Some(pending) = self.stuck.pop_back() {
             self.fresh.push_front(pending);
         }
+        self.projects.relieve_all();
     }
 
     pub(super) fn forget_pending(&mut self, gone: impl Fn(&Pending) -> bool) {
@@ -186,6 +187,9 @@ impl CoordinatorMachine {
 
     /// What is to be decided for a batch. `None` if nothing is: its jobs are gone, or wait in `stuck` or for their project.
     fn question(&mut self, now: Instant, mut pending: Pending) -> Option<(Pending, Question)> {
+        if !self.has_room(&mut pending) {
+            return None;
+        }
         let app = self.apps.get(&pending.app)?;
         let batch = app.batches.get(&pending.batch)?;
         let jobs = wanted(app, &pending);
@@ -262,7 +266,8 @@ impl CoordinatorMachine {
         let mut shares: Vec<Share> = question.devices.iter().map(share).collect();
         let Some(app) = self.apps.get_mut(&pending.app) else { return shares };
         let Some(batch) = app.batches.get_mut(&pending.batch) else { return shares };
-        batch.told = None;
+        // Of a quota it is told once: the jobs of a batch go out one by one there.
+        batch.told = batch.told.filter(|told| *told == WaitReason::OverQuota);
         for choice in choices {
             let wanted = &question.jobs[choice.job as usize];
             let key = JobKey { task: question.task, index: wanted.index };

@@ -12,7 +12,7 @@ use super::{
     policy::{Question, QuestionDevice, QuestionJob},
 };
 use crate::{
-    id::{AppId, ContentHash, JobId, JobKey, LinkId, NodeId},
+    id::{AppId, ContentHash, JobId, JobKey, LinkId},
     message::{CoordinatorToNode, JobFailure, WaitReason},
     program::Content,
     project::{AppTerms, DEFAULT_PROJECT, Quota},
@@ -45,22 +45,27 @@ struct Project {
     devices: BTreeMap<Place, u32>,
     /// Size in bytes of each content, and the batches that name it.
     contents: BTreeMap<ContentHash, (u64, u32)>,
-    content_bytes: u64,
+    /// Their sum; sizes are what applications say, up to the last of 64 bits.
+    content_bytes: u128,
     /// Jobs that wait until it has less.
     line: VecDeque<Pending>,
 }
 
 impl Project {
+    /// What its applications' weights come to by what these ask for; finite, however large each is.
+    fn asked_weight(&self) -> f64 {
+        self.apps.values().sum::<f64>().min(f64::MAX)
+    }
+
     /// What the weights of its applications are multiplied by.
     fn weight_scale(&self) -> f64 {
-        let asked: f64 = self.apps.values().sum();
-        self.quota.weight.map_or(1.0, |most| (most / asked).min(1.0))
+        self.quota.weight.map_or(1.0, |most| (most / self.asked_weight()).min(1.0))
     }
 
     /// Bytes of these contents that do not count yet.
-    fn additional_bytes(&self, contents: &[Content]) -> u64 {
+    fn additional_bytes(&self, contents: &[Content]) -> u128 {
         let new = distinct(contents).filter(|(hash, _)| !self.contents.contains_key(hash));
-        new.fold(0, |sum, (_, size_bytes)| sum.saturating_add(size_bytes))
+        new.map(|(_, size_bytes)| u128::from(size_bytes)).sum()
     }
 
     fn may_use(&self, place: Place) -> bool {
@@ -130,6 +135,12 @@ impl Projects {
         self.relieved.extend(self.of.get(&app));
     }
 
+    /// Somewhere a device takes work again.
+    pub(super) fn relieve_all(&mut self) {
+        let waits = self.projects.iter().filter(|(_, project)| !project.line.is_empty());
+        self.relieved.extend(waits.map(|(&slot, _)| slot));
+    }
+
     /// Whether a job of the application may be placed there.
     pub(super) fn may_use(&self, app: AppId, place: Place) -> bool {
         self.project_of(app).is_none_or(|project| project.may_use(place))
@@ -141,7 +152,7 @@ impl Projects {
         for (hash, size_bytes) in distinct(contents) {
             let (counted_bytes, batches) = project.contents.entry(hash).or_insert((size_bytes, 0));
             if *batches == 0 {
-                project.content_bytes = project.content_bytes.saturating_add(*counted_bytes);
+                project.content_bytes += u128::from(*counted_bytes);
             }
             *batches += 1;
         }
@@ -154,7 +165,7 @@ impl Projects {
             let Some((size_bytes, batches)) = project.contents.get_mut(&hash) else { continue };
             *batches -= 1;
             if *batches == 0 {
-                project.content_bytes = project.content_bytes.saturating_sub(*size_bytes);
+                project.content_bytes -= u128::from(*size_bytes);
                 project.contents.remove(&hash);
             }
         }
@@ -287,12 +298,12 @@ impl CoordinatorMachine {
     }
 
     fn tell_terms(&mut self, apps: impl IntoIterator<Item = AppId>) {
-        let nodes: Vec<NodeId> = self.nodes.keys().copied().collect();
-        for app in apps {
-            let terms = self.terms_of(app);
-            for &node in &nodes {
-                self.tell_node(node, CoordinatorToNode::AppJoined { app, terms: terms.clone() });
-            }
+        let apps: Vec<_> = apps.into_iter().map(|app| (app, self.terms_of(app))).collect();
+        if apps.is_empty() {
+            return;
+        }
+        for node in self.nodes.keys().copied().collect::<Vec<_>>() {
+            self.tell_node(node, CoordinatorToNode::AppsJoined(apps.clone()));
         }
     }
 
@@ -338,6 +349,28 @@ impl CoordinatorMachine {
         waits
     }
 
+    /// Leaves a batch as many of its waiting jobs as the project may have planned now; the others wait. False: there is no room.
+    pub(super) fn has_room(&mut self, pending: &mut Pending) -> bool {
+        let Some(most) = self.projects.quota_of(pending.app).queued_jobs else { return true };
+        let room = most.saturating_sub(self.planned_of_project(pending.app));
+        let Some(app) = self.apps.get(&pending.app) else { return false };
+        if room == 0 {
+            self.wait_for_project(pending, true);
+            return false;
+        }
+        let mut left = usize::try_from(room).unwrap_or(usize::MAX);
+        let fits = pending.keys.iter().take_while(|key| {
+            left -= usize::from(app.waiting_job(**key, pending.batch).is_some());
+            left > 0
+        });
+        let taken = fits.count() + 1;
+        if taken < pending.keys.len() {
+            let keys = pending.keys.split_off(taken);
+            self.projects.line_up(Pending { keys, ..*pending }, true);
+        }
+        true
+    }
+
     /// Reduces what is to be decided to what the application's project may have now; the other jobs wait. `None`: all do, or
     /// they need more than that project may ever have.
     pub(super) fn within_quota(&mut self, pending: &mut Pending, mut question: Question) -> Option<Question> {
@@ -365,28 +398,21 @@ impl CoordinatorMachine {
                 return self.wait_first(pending);
             }
         }
-        if let Some(most) = quota.queued_jobs {
-            let room = usize::try_from(most.saturating_sub(self.planned_of_project(pending.app)));
-            let room = room.unwrap_or(usize::MAX);
-            if room == 0 {
-                return self.wait_first(pending);
-            }
-            if room < question.jobs.len() {
-                question.jobs.truncate(room);
-                let keys = pending.keys.split_off(room);
-                self.projects.line_up(Pending { keys, ..*pending }, true);
-            }
-        }
         Some(question)
     }
 
     /// Whether what a policy chose is within the project's quotas still.
-    pub(super) fn is_within_quota(&self, app: AppId, jobs: usize, devices: &BTreeSet<Place>) -> bool {
+    pub(super) fn is_within_quota(&self, pending: &Pending, jobs: usize, devices: &BTreeSet<Place>) -> bool {
+        let app = pending.app;
         let Some(project) = self.projects.project_of(app) else { return true };
         let more = devices.iter().filter(|place| !project.devices.contains_key(place)).count();
-        let has_devices = |most| project.devices.len() + more <= most as usize;
+        // What the project is on it was offered, even where that is more than it may have now.
+        let has_devices = |most| more == 0 || project.devices.len() + more <= most as usize;
         let has_room = |most| self.planned_of_project(app) + jobs as u64 <= most;
-        project.quota.devices.is_none_or(has_devices) && project.quota.queued_jobs.is_none_or(has_room)
+        let has_bytes = |most| matches!(self.bytes_fit(pending, most), Fits::Now);
+        project.quota.devices.is_none_or(has_devices)
+            && project.quota.queued_jobs.is_none_or(has_room)
+            && project.quota.bytes.is_none_or(has_bytes)
     }
 
     /// Says where in its books a batch's contents count, once it has a place.
@@ -408,8 +434,8 @@ impl CoordinatorMachine {
                 devices: project.devices.len() as u64,
                 queued_jobs: self.planned(project),
                 waiting_jobs: self.apps_of(project).map(|app| app.waiting_jobs).sum(),
-                bytes: project.content_bytes,
-                weight: project.apps.values().sum::<f64>() * project.weight_scale(),
+                bytes: u64::try_from(project.content_bytes).unwrap_or(u64::MAX),
+                weight: project.asked_weight() * project.weight_scale(),
             })
             .collect()
     }
@@ -433,15 +459,16 @@ impl CoordinatorMachine {
         else {
             return Fits::Now;
         };
-        let alone = distinct(&batch.contents).fold(0_u64, |sum, (_, bytes)| sum.saturating_add(bytes));
-        if alone > most {
+        let most_bytes = u128::from(most);
+        let alone: u128 = distinct(&batch.contents).map(|(_, size_bytes)| u128::from(size_bytes)).sum();
+        if alone > most_bytes {
             return Fits::Never(format!(
                 "its task allocations and modules have {alone} B, project {} may have {most} B",
                 project.name
             ));
         }
-        let together = project.content_bytes.saturating_add(project.additional_bytes(&batch.contents));
-        if together > most { Fits::Later } else { Fits::Now }
+        let together = project.content_bytes + project.additional_bytes(&batch.contents);
+        if together > most_bytes { Fits::Later } else { Fits::Now }
     }
 
     /// The devices that the project is on, and others up to as many as it may have: of each those that would be done first with
@@ -520,7 +547,7 @@ impl CoordinatorMachine {
                 counted,
                 "I8: the contents of project {name}"
             );
-            let bytes = project.contents.values().fold(0_u64, |sum, (bytes, _)| sum.saturating_add(*bytes));
+            let bytes: u128 = project.contents.values().map(|(bytes, _)| u128::from(*bytes)).sum();
             assert_eq!(bytes, project.content_bytes, "I8: the bytes of project {name}");
         }
         assert_eq!(self.projects.of.len(), self.apps.len(), "I8: each application has one project");

@@ -88,8 +88,9 @@ impl CoordinatorMachine {
             id,
             CoordinatorToNode::Welcome { node: id, epoch: self.config.epoch, liveness: self.config.liveness },
         );
-        for app in self.apps.keys().copied().collect::<Vec<_>>() {
-            self.tell_node(id, CoordinatorToNode::AppJoined { app, terms: self.terms_of(app) });
+        let apps: Vec<_> = self.apps.keys().map(|&app| (app, self.terms_of(app))).collect();
+        if !apps.is_empty() {
+            self.tell_node(id, CoordinatorToNode::AppsJoined(apps));
         }
         if draining {
             self.tell_node(id, CoordinatorToNode::Drain);

@@ -42,7 +42,7 @@ pub(super) struct App {
     /// It has a share of the devices now.
     pub(super) awake: bool,
     /// Its project, once the coordinator said which.
-    project: String,
+    project: Option<String>,
     /// Its jobs are not taken by other devices than those that they were planned for.
     pub(super) stays: bool,
 }
@@ -50,8 +50,11 @@ pub(super) struct App {
 impl App {
     /// Whether it gets a further job: it leaves no more results behind than it may, and neither does its project.
     pub(super) fn takes_results(&self, quota_bytes: u64, projects: &BTreeMap<String, Project>) -> bool {
-        let fits = |project: &Project| project.quota_bytes.is_none_or(|quota| project.spool_bytes < quota);
-        self.spool_bytes < quota_bytes && projects.get(&self.project).is_none_or(fits)
+        // With a quota of nothing, too, one result may wait: nothing would ever run else.
+        let fits =
+            |project: &Project| project.quota_bytes.is_none_or(|most| project.spool_bytes < most.max(1));
+        let project = self.project.as_ref().and_then(|name| projects.get(name));
+        self.spool_bytes < quota_bytes && project.is_none_or(fits)
     }
 }
 
@@ -126,17 +129,22 @@ impl WorkerMachine {
 
     pub(super) fn app_joined(&mut self, id: AppId, terms: AppTerms) {
         let AppTerms { weight, project, result_bytes, stays } = terms;
-        self.leave_project(id);
+        if self.apps.get(&id).is_some_and(|app| app.project.as_ref() != Some(&project)) {
+            self.leave_project(id);
+        }
         let app = self.apps.entry(id).or_default();
         app.announced = true;
         app.drop_at = None;
-        app.project.clone_from(&project);
         app.stays = stays;
-        let entered = self.projects.entry(project).or_default();
-        entered.apps.insert(id);
-        entered.spool_bytes += app.spool_bytes;
-        entered.quota_bytes = result_bytes;
+        let entered = self.projects.entry(project.clone()).or_default();
+        if app.project.replace(project).is_none() {
+            entered.apps.insert(id);
+            entered.spool_bytes += app.spool_bytes;
+        }
+        let changed = std::mem::replace(&mut entered.quota_bytes, result_bytes) != result_bytes;
+        let settled = if changed { entered.apps.clone() } else { BTreeSet::from([id]) };
         self.lags.join(id, weight);
+        settled.into_iter().for_each(|app| self.settle_share(app));
         self.settle_shares_with(id);
     }
 
@@ -145,16 +153,18 @@ impl WorkerMachine {
         app.is_some_and(|app| app.takes_results(self.spool_quota_bytes(), &self.projects))
     }
 
-    /// What an application that may be gone meant to its project.
+    /// What an application leaves behind it takes along, and those who stay may get on by that.
     fn leave_project(&mut self, id: AppId) {
-        let Some(app) = self.apps.get(&id) else { return };
-        let Some(project) = self.projects.get_mut(&app.project) else { return };
-        if project.apps.remove(&id) {
-            project.spool_bytes -= app.spool_bytes;
-        }
+        let Some(app) = self.apps.get_mut(&id) else { return };
+        let Some(name) = app.project.take() else { return };
+        let Some(project) = self.projects.get_mut(&name) else { return };
+        project.apps.remove(&id);
+        project.spool_bytes -= app.spool_bytes;
+        let staying = project.quota_bytes.map_or_else(BTreeSet::new, |_| project.apps.clone());
         if project.apps.is_empty() {
-            self.projects.remove(&app.project);
+            self.projects.remove(&name);
         }
+        staying.into_iter().for_each(|app| self.settle_share(app));
     }
 
     /// I8: a project's results are those of its applications.
@@ -169,7 +179,7 @@ impl WorkerMachine {
 
     /// An application's project may have reached its quota, or left it behind.
     fn settle_shares_with(&mut self, id: AppId) {
-        let project = self.apps.get(&id).and_then(|app| self.projects.get(&app.project));
+        let project = self.apps.get(&id).and_then(|app| self.projects.get(app.project.as_ref()?));
         match project.filter(|project| project.quota_bytes.is_some()) {
             Some(project) => project.apps.clone().into_iter().for_each(|app| self.settle_share(app)),
             None => self.settle_share(id),
@@ -293,7 +303,7 @@ impl WorkerMachine {
         self.spool_bytes = change(self.spool_bytes);
         if let Some(app) = self.apps.get_mut(&id) {
             app.spool_bytes = change(app.spool_bytes);
-            if let Some(project) = self.projects.get_mut(&app.project) {
+            if let Some(project) = app.project.as_ref().and_then(|name| self.projects.get_mut(name)) {
                 project.spool_bytes = change(project.spool_bytes);
             }
             self.settle_shares_with(id);

@@ -73,7 +73,9 @@ impl WorkerMachine {
                 self.tell_cache();
             }
             CoordinatorToNode::Refused { reason } => self.refused(&reason),
-            CoordinatorToNode::AppJoined { app, terms } => self.app_joined(app, terms),
+            CoordinatorToNode::AppsJoined(apps) => {
+                apps.into_iter().for_each(|(app, terms)| self.app_joined(app, terms));
+            }
             CoordinatorToNode::AppLeft { app } => self.app_left(app),
             CoordinatorToNode::Cancel { jobs } => jobs.into_iter().for_each(|job| self.cancel(job)),
             CoordinatorToNode::Retract { steal, jobs } => self.retract(steal, &jobs),

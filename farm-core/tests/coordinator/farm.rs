@@ -51,6 +51,8 @@ pub(crate) struct Farm {
     pub(crate) given_up: Vec<JobFailure>,
     /// What node 1 was told last of what each application may have.
     pub(crate) terms: BTreeMap<AppId, AppTerms>,
+    /// How often it was told of some.
+    pub(crate) announcements: u32,
 }
 
 impl Farm {
@@ -75,6 +77,7 @@ impl Farm {
             waits: Vec::new(),
             given_up: Vec::new(),
             terms: BTreeMap::new(),
+            announcements: 0,
         };
         for (node, &score) in (1..).zip(scores) {
             farm.node_joins(node, score);
@@ -171,8 +174,9 @@ impl Farm {
                 Effect::ToApp { message: CoordinatorToApp::JobFailed { failure, .. }, .. } => {
                     self.given_up.push(failure);
                 }
-                Effect::ToNode { link: LinkId(1), message: CoordinatorToNode::AppJoined { app, terms } } => {
-                    self.terms.insert(app, terms);
+                Effect::ToNode { link: LinkId(1), message: CoordinatorToNode::AppsJoined(apps) } => {
+                    self.announcements += 1;
+                    self.terms.extend(apps);
                 }
                 Effect::ToNode { link, message: CoordinatorToNode::SayInventory } => self.asked.push(link.0),
                 Effect::ToNode { link, message: CoordinatorToNode::Located { peer, .. } } => {

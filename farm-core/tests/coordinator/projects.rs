@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use farm_core::{
-    coordinator::{Event, ProjectStatus},
+    coordinator::{Event, ProjectStatus, policy::Choice},
     id::{AppId, ContentHash, JobAttempt, LinkId},
     message::{AppHello, AppToCoordinator, JobFailure, WaitReason},
     program::Content,
@@ -206,4 +206,101 @@ fn a_removed_project_is_forgotten_with_its_last_application() {
     assert_eq!(farm.terms[&app].weight, 2.0);
     assert!(farm.machine.status().projects.iter().all(|project| project.project == DEFAULT_PROJECT));
     farm.handle(Event::FromApp { link: LinkId(50), message: AppToCoordinator::Goodbye });
+}
+
+/// The review of 2026-11-29: nodes hear of many applications in one message, or their queue of messages overflows.
+#[test]
+fn a_node_hears_of_all_applications_at_once() {
+    let mut farm = Farm::new("", &[1_000.0]);
+    set(&mut farm, "films", Quota { weight: Some(1e9), ..Quota::default() });
+    for app in 0..200 {
+        joins(&mut farm, 1_000 + app, "films", 1.0);
+    }
+    let before = farm.announcements;
+    set(&mut farm, "films", Quota { weight: Some(3.0), ..Quota::default() });
+    joins(&mut farm, 2_000, "films", 1.0);
+    assert_eq!(farm.announcements - before, 2, "one for the quota, one for the newcomer");
+    farm.stop_taking(1);
+    farm.node_joins(1, 1_000.0);
+    assert_eq!((farm.announcements - before, farm.terms.len()), (3, 202), "and one for a hello");
+}
+
+/// The review of 2026-11-29: weights that are too large to be added made a status that no client reads.
+#[test]
+fn weights_come_to_a_finite_number() {
+    let mut farm = Farm::new("", &[1_000.0]);
+    for link in [50, 51] {
+        joins(&mut farm, link, "films", f64::MAX);
+    }
+    let weight = |farm: &Farm| farm.machine.status().projects.pop().unwrap().weight;
+    assert_eq!(weight(&farm), f64::MAX);
+    set(&mut farm, "films", Quota { weight: Some(2.0), ..Quota::default() });
+    assert!((weight(&farm) - 2.0).abs() < 1e-9, "{}", weight(&farm));
+    assert!(farm.machine.status().apps.iter().all(|app| app.weight > 0.0 && app.weight.is_finite()));
+}
+
+/// The review of 2026-11-29: right answers of a plug-in were asked for again without end.
+#[test]
+fn a_plug_in_may_stay_on_more_devices_than_the_project_may_have_now() {
+    let mut farm = Farm::new("spread", &[1_000.0; 3]);
+    farm.plan(&[10; 3], 1, &[]);
+    let answer = |farm: &mut Farm, choices: Vec<Choice>| {
+        let (question, ..) = farm.questions.pop().unwrap();
+        farm.handle(Event::PolicyAnswered { question, answer: Ok(choices) })
+    };
+    answer(&mut farm, (0..3).map(|n| Choice { job: n, device: n }).collect());
+    set(&mut farm, DEFAULT_PROJECT, Quota { devices: Some(2), ..Quota::default() });
+    farm.plan(&[10], 1, &[]);
+    assert_eq!(total(&answer(&mut farm, vec![Choice { job: 0, device: 0 }])), 1);
+    assert!(farm.questions.is_empty());
+}
+
+/// The review of 2026-11-29: what a plug-in was asked about did not count, and each of several answers went through.
+#[test]
+fn a_plug_ins_answers_are_within_the_bytes_together() {
+    let mut farm = Farm::new("spread", &[1_000.0]);
+    set(&mut farm, DEFAULT_PROJECT, Quota { bytes: Some(100), ..Quota::default() });
+    for tag in [1, 2] {
+        farm.plan(&[10], 1, &[Content { hash: ContentHash([tag; 32]), size_bytes: 60 }]);
+    }
+    for (question, ..) in std::mem::take(&mut farm.questions) {
+        let answer = Ok(vec![Choice { job: 0, device: 0 }]);
+        farm.handle(Event::PolicyAnswered { question, answer });
+    }
+    assert_eq!((project(&farm).bytes, project(&farm).waiting_jobs), (60, 1));
+}
+
+/// The review of 2026-11-29: a node that is heard again helps those who wait for their project, too.
+#[test]
+fn who_waits_for_a_device_of_the_project_goes_on_when_its_node_is_back() {
+    let mut farm = limited(&[1_000.0; 2], Quota { devices: Some(1), ..Quota::default() });
+    let first = farm.plan(&[3_600_000], 1, &[]);
+    let (&node, _) = first.iter().next().unwrap();
+    farm.says_unanswered(node, true);
+    assert_eq!(total(&farm.plan(&[10; 3], 1, &[])), 0);
+    assert_eq!(total(&farm.says_unanswered(node, false)), 3);
+}
+
+/// The review of 2026-11-29.
+#[test]
+fn sizes_up_to_the_last_bit_are_added_and_taken_off_again() {
+    let mut farm = Farm::new("", &[1_000.0]);
+    let content = |tag, size_bytes| Content { hash: ContentHash([tag; 32]), size_bytes };
+    let first = farm.plan(&[10], 1, &[content(1, u64::MAX)]);
+    farm.plan(&[10], 1, &[content(2, 500)]);
+    assert_eq!(project(&farm).bytes, u64::MAX);
+    farm.ended(1, first[&1][0], 10);
+    assert_eq!(project(&farm).bytes, 500);
+}
+
+/// The review of 2026-11-29: every end told the application anew that it waits.
+#[test]
+fn a_batch_that_goes_out_one_by_one_is_told_once() {
+    let mut farm = limited(&[1_000.0], Quota { queued_jobs: Some(1), ..Quota::default() });
+    let mut open = farm.plan(&[10; 50], 1, &[]);
+    while let Some(job) = open.remove(&1).map(|jobs| jobs[0]) {
+        open = farm.ended(1, job, 10);
+    }
+    assert_eq!(farm.open_jobs(), 0);
+    assert!(farm.waits.len() <= 1, "{:?}", farm.waits);
 }

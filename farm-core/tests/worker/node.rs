@@ -67,16 +67,22 @@ impl Node {
         let (id, epoch, liveness) = (NodeId(1), Epoch(1), Liveness::default());
         node.tell(Event::FromCoordinator(CoordinatorToNode::Welcome { node: id, epoch, liveness }));
         for app in 1..=apps {
-            let terms = AppTerms::unlimited(1.0);
-            node.tell(Event::FromCoordinator(CoordinatorToNode::AppJoined { app: AppId(app), terms }));
-            let hello = AppToNode::Hello {
-                protocol: PROTOCOL_VERSION,
-                app: AppId(app),
-                incarnation: AppIncarnation(1),
-            };
-            node.tell(Event::FromApp { link: LinkId(app), message: hello });
+            node.joined(app, AppTerms::unlimited(1.0));
+            node.hello(app);
         }
         node
+    }
+
+    /// An application dials.
+    pub(crate) fn hello(&mut self, app: u64) {
+        let (protocol, incarnation) = (PROTOCOL_VERSION, AppIncarnation(1));
+        let message = AppToNode::Hello { protocol, app: AppId(app), incarnation };
+        self.tell(Event::FromApp { link: LinkId(app), message });
+    }
+
+    /// The coordinator says what an application may have.
+    pub(crate) fn joined(&mut self, app: u64, terms: AppTerms) {
+        self.tell(Event::FromCoordinator(CoordinatorToNode::AppsJoined(vec![(AppId(app), terms)])));
     }
 
     pub(crate) fn tell(&mut self, event: Event) {

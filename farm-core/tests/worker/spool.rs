@@ -1,8 +1,8 @@
 //! Results that nobody takes: they cost their application its turn, and nobody else anything.
 
 use farm_core::{
-    id::{AppId, ContentHash, DeviceIndex, JobAttempt},
-    message::{CoordinatorToNode, LatencyClass},
+    id::{ContentHash, DeviceIndex, JobAttempt},
+    message::LatencyClass,
     project::AppTerms,
     worker::Event,
 };
@@ -114,7 +114,7 @@ fn a_project_that_leaves_too_much_behind_is_held_back_as_a_whole() {
     for app in [1, 2] {
         let terms =
             AppTerms { project: "films".to_owned(), result_bytes: Some(500), ..AppTerms::unlimited(1.0) };
-        node.tell(Event::FromCoordinator(CoordinatorToNode::AppJoined { app: AppId(app), terms }));
+        node.joined(app, terms);
     }
     let one = node.jobs(1, 0, 5, LatencyClass::Batch);
     let ran = run_all(&mut node, RESULT_BYTES);
@@ -137,11 +137,56 @@ fn a_project_that_leaves_too_much_behind_is_held_back_as_a_whole() {
 fn an_application_that_stays_is_not_spread_over_siblings() {
     let mut node = Node::new(2, true, 1);
     let terms = AppTerms { stays: true, ..AppTerms::unlimited(1.0) };
-    node.tell(Event::FromCoordinator(CoordinatorToNode::AppJoined { app: AppId(1), terms }));
+    node.joined(1, terms);
     node.jobs(1, 0, 6, LatencyClass::Batch);
     assert!(node.orders().iter().all(|(_, device, _)| *device == 0), "device 1 is idle, and stays so");
     let terms = AppTerms::unlimited(1.0);
-    node.tell(Event::FromCoordinator(CoordinatorToNode::AppJoined { app: AppId(1), terms }));
+    node.joined(1, terms);
     node.pass_ms(10);
     assert!(node.orders().iter().any(|(_, device, _)| *device == 1), "the quota was lifted");
+}
+
+/// The review of 2026-11-29: a quota that is lifted, or an application that moves on, lets those who stay get on.
+#[test]
+fn who_was_held_back_by_the_project_gets_on_when_the_quota_or_the_culprit_goes() {
+    let of = |project: &str, result_bytes| AppTerms {
+        project: project.to_owned(),
+        result_bytes,
+        ..AppTerms::unlimited(1.0)
+    };
+    let full = || {
+        let mut node = Node::new(1, true, 2);
+        node.joined(1, of("films", Some(500)));
+        node.joined(2, of("films", Some(500)));
+        node.jobs(1, 0, 2, LatencyClass::Batch);
+        assert_eq!(run_all(&mut node, RESULT_BYTES).len(), 2);
+        let waits = node.jobs(2, 0, 3, LatencyClass::Batch);
+        assert!(node.orders().is_empty());
+        (node, waits)
+    };
+    let (mut node, waits) = full();
+    node.joined(1, of("films", None));
+    assert_eq!(run_all(&mut node, 0), waits, "the quota is lifted for both");
+    let (mut node, waits) = full();
+    node.joined(1, of("ads", Some(5_000)));
+    assert_eq!(run_all(&mut node, 0), waits, "what the first left behind is another project's");
+}
+
+#[test]
+fn with_a_quota_of_nothing_one_result_waits_at_a_time() {
+    let mut node = Node::new(1, true, 1);
+    let terms = AppTerms { result_bytes: Some(0), ..AppTerms::unlimited(1.0) };
+    node.joined(1, terms);
+    let jobs = node.jobs(1, 0, 4, LatencyClass::Batch);
+    assert_eq!(run_all(&mut node, 10), jobs[..2], "and one that was staged by then");
+}
+
+/// The review of 2026-11-29: a project may be called anything, and strangers are of none.
+#[test]
+fn applications_that_nobody_vouched_for_are_of_no_project() {
+    let mut node = Node::new(1, true, 1);
+    node.joined(1, AppTerms { project: String::new(), result_bytes: Some(1), ..AppTerms::unlimited(1.0) });
+    node.hello(2);
+    let jobs = node.jobs(2, 0, 3, LatencyClass::Batch);
+    assert_eq!(run_all(&mut node, 10), jobs);
 }

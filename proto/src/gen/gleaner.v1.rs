@@ -2037,9 +2037,9 @@ pub mod coordinator_to_node {
         /// Not registered, or expelled; the connection closes.
         #[prost(message, tag = "2")]
         Refused(super::Refused),
-        /// An application may send jobs.
+        /// Applications may send jobs.
         #[prost(message, tag = "3")]
-        AppJoined(super::AppJoined),
+        AppsJoined(super::AppsJoined),
         /// Everything of an application can be freed.
         #[prost(message, tag = "4")]
         AppLeft(super::AppLeft),
@@ -2079,7 +2079,14 @@ pub struct NodeWelcome {
     #[prost(message, optional, tag = "3")]
     pub liveness: ::core::option::Option<Liveness>,
 }
-/// An application may send jobs; said again when what it may have changes.
+/// Applications may send jobs; said again of those of which what they may have changes.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct AppsJoined {
+    /// Each once.
+    #[prost(message, repeated, tag = "1")]
+    pub apps: ::prost::alloc::vec::Vec<AppJoined>,
+}
+/// An application, and what it may have.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct AppJoined {
     /// Which.
@@ -2511,7 +2518,7 @@ pub struct ListMembersRequest {}
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct ListMembersResponse {
     /// By URI.
-    #[prost(message, repeated, tag = "1")]
+    #[prost(message, repeated, tag = "2")]
     pub members: ::prost::alloc::vec::Vec<MemberStatus>,
 }
 /// A member.

@@ -258,6 +258,27 @@ fn failure_of(wire: v1::ExecutedFailure) -> Result<JobFailure, WireError> {
     required("ExecutedFailure.failure", wire.failure)?.try_into()
 }
 
+impl From<(AppId, AppTerms)> for v1::AppJoined {
+    fn from((app, terms): (AppId, AppTerms)) -> Self {
+        let AppTerms { weight, project, result_bytes, stays } = terms;
+        Self { app: app.0, weight, project, result_bytes, stays }
+    }
+}
+
+impl TryFrom<v1::AppJoined> for (AppId, AppTerms) {
+    type Error = WireError;
+
+    fn try_from(wire: v1::AppJoined) -> Result<Self, WireError> {
+        let terms = AppTerms {
+            weight: weight("AppJoined.weight", wire.weight)?,
+            project: name("AppJoined.project", wire.project)?,
+            result_bytes: wire.result_bytes,
+            stays: wire.stays,
+        };
+        Ok((AppId(wire.app), terms))
+    }
+}
+
 impl From<CoordinatorToNode> for v1::CoordinatorToNode {
     fn from(message: CoordinatorToNode) -> Self {
         use v1::coordinator_to_node::Message;
@@ -268,13 +289,9 @@ impl From<CoordinatorToNode> for v1::CoordinatorToNode {
                 liveness: Some(liveness.into()),
             }),
             CoordinatorToNode::Refused { reason } => Message::Refused(v1::Refused { reason: cut(reason) }),
-            CoordinatorToNode::AppJoined { app, terms } => Message::AppJoined(v1::AppJoined {
-                app: app.0,
-                weight: terms.weight,
-                project: terms.project,
-                result_bytes: terms.result_bytes,
-                stays: terms.stays,
-            }),
+            CoordinatorToNode::AppsJoined(apps) => {
+                Message::AppsJoined(v1::AppsJoined { apps: apps.into_iter().map(Into::into).collect() })
+            }
             CoordinatorToNode::AppLeft { app } => Message::AppLeft(v1::AppLeft { app: app.0 }),
             CoordinatorToNode::Cancel { jobs } => Message::Cancel(jobs.as_slice().into()),
             CoordinatorToNode::Retract { steal, jobs } => {
@@ -308,15 +325,9 @@ impl TryFrom<v1::CoordinatorToNode> for CoordinatorToNode {
                 liveness: required("NodeWelcome.liveness", welcome.liveness)?.into(),
             },
             Message::Refused(refused) => Self::Refused { reason: text("Refused.reason", refused.reason)? },
-            Message::AppJoined(joined) => Self::AppJoined {
-                app: AppId(joined.app),
-                terms: AppTerms {
-                    weight: weight("AppJoined.weight", joined.weight)?,
-                    project: name("AppJoined.project", joined.project)?,
-                    result_bytes: joined.result_bytes,
-                    stays: joined.stays,
-                },
-            },
+            Message::AppsJoined(joined) => {
+                Self::AppsJoined(list("AppsJoined.apps", MAX_ENTRIES, joined.apps)?)
+            }
             Message::AppLeft(v1::AppLeft { app }) => Self::AppLeft { app: AppId(app) },
             Message::Cancel(jobs) => Self::Cancel { jobs: jobs.try_into()? },
             Message::Retract(order) => Self::Retract {
