@@ -234,6 +234,13 @@ impl Security {
         }
     }
 
+    /// Writes down what an operator was refused; a store that fails refuses nobody.
+    fn denied(&self, what: &str, operator: &Member, error: &StoreError) {
+        if let StoreError::Denied(reason) = error {
+            self.audit.refused(what, &operator.principal.to_string(), reason);
+        }
+    }
+
     fn join(&self, request: &v1::JoinRequest, address: &str) -> Result<Membership, StoreError> {
         let issue =
             |role, name: &str| self.authority.admit(role, name, &request.request_der, IDENTITY_LIFETIME);
@@ -241,7 +248,8 @@ impl Security {
         match &joined {
             Ok(membership) => {
                 let who = Member::of_certificate(&membership.certificate_der)?.principal;
-                self.audit.done("joined", &who.to_string(), json!({ "from": address }));
+                let project = self.store.project_of(&who)?;
+                self.audit.done("joined", &who.to_string(), json!({ "from": address, "project": project }));
             }
             Err(error) => self.audit.refused("join", address, &error.to_string()),
         }
@@ -309,7 +317,10 @@ impl Trust for TrustService {
             let details = json!({
                 "role": token.role, "name": token.name, "uses": token.uses_left, "project": token.project,
             });
-            let id = security.store.add_token(&secret, token, unix_now())?;
+            let id = security
+                .store
+                .add_token(&secret, token, unix_now())
+                .inspect_err(|error| security.denied("make a token", &operator, error))?;
             let details = json!({ "id": id, "token": details });
             security.audit.done("token created", &operator.principal.to_string(), details);
             Ok(id)
@@ -388,7 +399,10 @@ impl Trust for TrustService {
         check_name("project", &project).map_err(|error| wrong(error.to_string()))?;
         let name = project.clone();
         let set = on_disk(move || {
-            let quota = security.store.set_project(&name, change)?;
+            let quota = security
+                .store
+                .set_project(&name, change)
+                .inspect_err(|error| security.denied("set a project", &operator, error))?;
             let details = json!({ "project": name, "quota": quota });
             security.audit.done("project set", &operator.principal.to_string(), details);
             Ok(quota)
@@ -411,7 +425,8 @@ impl Trust for TrustService {
         let project = request.into_inner().project;
         let name = project.clone();
         let removed = on_disk(move || {
-            if !security.store.remove_project(&name, unix_now())? {
+            let removed = security.store.remove_project(&name, unix_now());
+            if !removed.inspect_err(|error| security.denied("remove a project", &operator, error))? {
                 return Ok(false);
             }
             let details = json!({ "project": name });
@@ -437,7 +452,10 @@ impl Trust for TrustService {
             .parse()
             .map_err(|error: proto::trust::TrustError| Status::invalid_argument(error.to_string()))?;
         let expelled = on_disk(move || {
-            let was = security.store.expel(&principal)?;
+            let was = security
+                .store
+                .expel(&principal)
+                .inspect_err(|error| security.denied("expel", &operator, error))?;
             if was {
                 let details = json!({ "member": principal.to_string() });
                 security.audit.done("expelled", &operator.principal.to_string(), details);

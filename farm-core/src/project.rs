@@ -22,6 +22,14 @@ pub struct Quota {
     pub weight: Option<f64>,
 }
 
+impl Quota {
+    /// Whether nothing is planned.
+    #[must_use]
+    pub fn is_suspension(&self) -> bool {
+        self.devices == Some(0) || self.queued_jobs == Some(0)
+    }
+}
+
 /// What an application may have of a node.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct AppTerms {

@@ -377,7 +377,7 @@ pub(crate) struct InitArgs {
 pub(crate) struct JoinArgs {
     /// The token; `-` reads it from standard input, which keeps it out of the list of processes.
     pub token: String,
-    /// Your name in the farm, where the token has none: of a node its name, else your project's [default: this host's].
+    /// Your name in the farm, where the token has none: of a node its name, else yours [default: this host's].
     #[arg(long, value_name = "NAME")]
     pub name: Option<String>,
 }
@@ -403,7 +403,11 @@ pub(crate) enum TokenVerb {
         project: Option<String>,
     },
     /// List the tokens that can still be used.
-    Ls,
+    Ls {
+        /// How to print it.
+        #[arg(short, long, value_enum)]
+        output: Option<Format>,
+    },
     /// Take a token back.
     Revoke {
         /// Its number.
@@ -425,8 +429,12 @@ pub(crate) enum MemberRole {
 #[derive(Debug, Subcommand)]
 pub(crate) enum MemberVerb {
     /// List the farm's members.
-    Ls,
-    /// End a membership; the sessions it has go on until they end.
+    Ls {
+        /// How to print it.
+        #[arg(short, long, value_enum)]
+        output: Option<Format>,
+    },
+    /// End a membership: its sessions end, and what its applications have on the farm goes half a minute later.
     Expel {
         /// Whose: gleaner://FARM/ROLE/NAME, as `ls` says.
         member: String,
@@ -436,7 +444,11 @@ pub(crate) enum MemberVerb {
 #[derive(Debug, Subcommand)]
 pub(crate) enum ProjectVerb {
     /// List projects: what each has, and what it may have.
-    Ls,
+    Ls {
+        /// How to print it.
+        #[arg(short, long, value_enum)]
+        output: Option<Format>,
+    },
     /// Make a project, or change what its applications may have together; what you do not name stays.
     Set {
         /// Its name; `default` is the project of those who were put into no other.

@@ -178,7 +178,7 @@ fn message(now: &Progress, units: &Units, elapsed: Duration) -> String {
     format!("{rate} {}/s  ETA {left}  nodes {}{quota}", units.name, now.nodes)
 }
 
-const OVER_QUOTA: &str = "your project has as much of the farm as it may have";
+const OVER_QUOTA: &str = "your project has as much of the farm as it may have (`farmctl project ls`)";
 
 /// Why nothing goes on, if it does not.
 const fn waits(now: &Progress) -> Option<&'static str> {

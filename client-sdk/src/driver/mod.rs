@@ -371,6 +371,12 @@ impl Driver {
             SessionError::Denied { reason } => FarmError::Denied { address, reason: reason.clone() },
             error => FarmError::Unreachable { address, reason: error.to_string() },
         }));
+        if let SessionError::Denied { reason } = &error {
+            // It is there, and will say the same again.
+            let denied =
+                || FarmError::Denied { address: self.options.coordinator.clone(), reason: reason.clone() };
+            self.runs.end_all(|| RunEnd::Farm(denied()));
+        }
         self.coordinator.lost(&error, Instant::now());
         self.tell_ledger(Event::CoordinatorLost);
     }

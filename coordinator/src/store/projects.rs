@@ -44,14 +44,18 @@ impl Store {
                 let (member, project) = entry.map_err(broken)?;
                 if project.value() == name {
                     let member = member.value();
-                    return Err(StoreError::Denied(format!("{member} belongs to the project {name}")));
+                    return Err(StoreError::Denied(format!(
+                        "the project {name} stays: {member} belongs to it"
+                    )));
                 }
             }
             for entry in transaction.open_table(TOKENS).map_err(broken)?.iter().map_err(broken)? {
                 let token = parse(entry.map_err(broken)?.1.value())?;
                 if token.project == name && token.expires_s > now_s {
                     let id = token.id;
-                    return Err(StoreError::Denied(format!("token {id} is for the project {name}")));
+                    return Err(StoreError::Denied(format!(
+                        "the project {name} stays: token {id} is for it"
+                    )));
                 }
             }
             let mut projects = transaction.open_table(PROJECTS).map_err(broken)?;

@@ -131,12 +131,20 @@ fn projects(page: &mut Page, status: &FarmStatus) {
             |quota| quota.weight,
         ),
     ];
+    page.family(
+        "gleaner_project_waiting_jobs",
+        "gauge",
+        "Jobs of each project that wait at the coordinator.",
+    );
+    for project in &status.projects {
+        page.sample("gleaner_project_waiting_jobs", &[("project", &project.project)], project.waiting_jobs);
+    }
     for (name, name_of_most, help, figure, most) in families {
         page.family(name, "gauge", help);
         for project in &status.projects {
             page.sample(name, &[("project", &project.project)], figure(project));
         }
-        page.family(name_of_most, "gauge", "What they may come to.");
+        page.family(name_of_most, "gauge", "Its quota, of the projects that have one.");
         for project in &status.projects {
             if let Some(most) = most(&project.quota) {
                 page.sample(name_of_most, &[("project", &project.project)], most);

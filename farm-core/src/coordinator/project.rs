@@ -54,7 +54,8 @@ struct Project {
 impl Project {
     /// What its applications' weights come to by what these ask for; finite, however large each is.
     fn asked_weight(&self) -> f64 {
-        self.apps.values().sum::<f64>().min(f64::MAX)
+        // Not `sum`: of nothing that is -0.0.
+        self.apps.values().fold(0.0, |sum, weight| sum + weight).min(f64::MAX)
     }
 
     /// What the weights of its applications are multiplied by.
@@ -415,7 +416,7 @@ impl CoordinatorMachine {
             && project.quota.bytes.is_none_or(has_bytes)
     }
 
-    /// Says where in its books a batch's contents count, once it has a place.
+    /// A batch has its first place: its contents count from now on.
     pub(super) fn count_contents(&mut self, pending: &Pending) {
         let batch = self.apps.get_mut(&pending.app).and_then(|app| app.batches.get_mut(&pending.batch));
         if let Some(batch) = batch.filter(|batch| !batch.counted) {

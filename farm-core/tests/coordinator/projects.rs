@@ -239,6 +239,15 @@ fn weights_come_to_a_finite_number() {
     assert!(farm.machine.status().apps.iter().all(|app| app.weight > 0.0 && app.weight.is_finite()));
 }
 
+/// A newcomer, 2026-11-29: the documented `project set films --weight 2` made a status that no client reads.
+#[test]
+fn a_project_without_applications_weighs_nothing() {
+    let mut farm = Farm::new("", &[1_000.0]);
+    set(&mut farm, "films", Quota { weight: Some(2.0), ..Quota::default() });
+    let films = farm.machine.status().projects.pop().unwrap();
+    assert_eq!((films.project.as_str(), films.weight.to_bits()), ("films", 0));
+}
+
 /// The review of 2026-11-29: right answers of a plug-in were asked for again without end.
 #[test]
 fn a_plug_in_may_stay_on_more_devices_than_the_project_may_have_now() {

@@ -175,9 +175,9 @@ pub(crate) async fn token(verb: &TokenVerb, target: &Target<'_>, format: Format)
             // The token alone: scripts take it as it is.
             output::print(&made, format, |_, _| format!("{token}\n"))
         }
-        TokenVerb::Ls => {
+        TokenVerb::Ls { output } => {
             let tokens: Vec<Value> = admin.tokens().await?.iter().map(shown).collect();
-            output::print(&tokens, format, |tokens, _| tokens_table(tokens))
+            output::print(&tokens, output.unwrap_or(format), |tokens, _| tokens_table(tokens))
         }
         TokenVerb::Revoke { id } => {
             admin.revoke_token(*id).await?;
@@ -244,9 +244,9 @@ fn members_lines(members: &[Value]) -> String {
 pub(crate) async fn member(verb: &MemberVerb, target: &Target<'_>, format: Format) -> Result<(), Failure> {
     let admin = Admin::new(target.existing().await?);
     match verb {
-        MemberVerb::Ls => {
+        MemberVerb::Ls { output } => {
             let members: Vec<Value> = admin.members().await?.iter().map(shown_member).collect();
-            output::print(&members, format, |members, _| members_lines(members))
+            output::print(&members, output.unwrap_or(format), |members, _| members_lines(members))
         }
         MemberVerb::Expel { member } => {
             admin.expel(member).await?;

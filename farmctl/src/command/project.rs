@@ -19,9 +19,9 @@ use crate::{
 pub(crate) async fn run(verb: &ProjectVerb, target: &Target<'_>, format: Format) -> Result<(), Failure> {
     let admin = Admin::new(target.existing().await?);
     match verb {
-        ProjectVerb::Ls => {
+        ProjectVerb::Ls { output } => {
             let projects = admin.status().await?.projects;
-            output::print(&projects, format, |projects, _| table(projects))
+            output::print(&projects, output.unwrap_or(format), |projects, _| table(projects))
         }
         ProjectVerb::Set { project, devices, queued_jobs, bytes, weight } => {
             let change = QuotaChange {
@@ -78,7 +78,11 @@ fn words(quota: &Quota) -> String {
     .into_iter()
     .flatten()
     .collect();
-    if bounds.is_empty() { "as much as there is".to_owned() } else { bounds.join(", ") }
+    match (quota.is_suspension(), bounds.is_empty()) {
+        (true, _) => format!("nothing new, it is suspended ({})", bounds.join(", ")),
+        (false, true) => "as much as there is".to_owned(),
+        (false, false) => bounds.join(", "),
+    }
 }
 
 #[cfg(test)]
@@ -105,5 +109,7 @@ mod tests {
         assert_eq!(words(&quota), "4 devices, 1.0 GiB");
         assert_eq!(words(&Quota { queued_jobs: Some(1), ..Quota::default() }), "1 queued job");
         assert_eq!(words(&Quota::default()), "as much as there is");
+        let suspended = Quota { queued_jobs: Some(0), ..Quota::default() };
+        assert_eq!(words(&suspended), "nothing new, it is suspended (0 queued jobs)");
     }
 }

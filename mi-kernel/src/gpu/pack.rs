@@ -1,5 +1,7 @@
 //! An alignment's bytes as kernels bind them, and how its pairs are split over bindings.
 
+use std::{num::NonZero, thread};
+
 use farm_core::program::Content;
 use thiserror::Error;
 
@@ -274,20 +276,35 @@ impl PackedAlignment {
     }
 }
 
+/// On all cores: it is what an application does before its first job, and of large alignments it takes half a second of one.
 fn symbol_order(alignment: &Alignment, bounds: &[u32], chunk: Chunk) -> Vec<u8> {
-    let stride = alignment.n().next_multiple_of(2);
-    let mut rows = vec![0_u16; stride * chunk.columns as usize];
-    let columns = chunk.first_i as usize..(chunk.first_i + chunk.columns) as usize;
-    for (column, rows) in columns.zip(rows.chunks_exact_mut(stride)) {
-        let first = column * (alignment.q() + 1);
-        let mut next = bounds[first..first + alignment.q()].to_vec();
-        for (row, code) in (0_u16..).zip(alignment.column(column)) {
-            let place = &mut next[usize::from(*code)];
-            rows[*place as usize] = row;
-            *place += 1;
+    let stride = 2 * alignment.n().next_multiple_of(2);
+    let columns = chunk.columns as usize;
+    let mut orders = vec![0; stride * columns];
+    let cores = thread::available_parallelism().map_or(1, NonZero::get);
+    let share = columns.div_ceil(cores);
+    thread::scope(|scope| {
+        for (number, orders) in orders.chunks_mut((stride * share).max(1)).enumerate() {
+            scope.spawn(move || {
+                let first = chunk.first_i as usize + number * share;
+                for (column, order) in (first..).zip(orders.chunks_exact_mut(stride)) {
+                    order_column(alignment, bounds, column, order);
+                }
+            });
         }
+    });
+    orders
+}
+
+fn order_column(alignment: &Alignment, bounds: &[u32], column: usize, order: &mut [u8]) {
+    let first = column * (alignment.q() + 1);
+    let mut next = bounds[first..first + alignment.q()].to_vec();
+    for (row, code) in (0_u16..).zip(alignment.column(column)) {
+        let place = &mut next[usize::from(*code)];
+        let at = 2 * *place as usize;
+        order[at..at + 2].copy_from_slice(&row.to_ne_bytes());
+        *place += 1;
     }
-    bytemuck::cast_slice(&rows).to_vec()
 }
 
 /// The names of a packed alignment's arrays in the farm, and of the module.
