@@ -26,12 +26,13 @@ const SEEDS: [(&str, &[u64]); 4] = [
     // completed queues were taken for so short that nothing was worth a steal. 24543: all nodes waited for a content to come to
     // one whose application was gone. 1083, 10071: a coordinator that takes over what its predecessor planned knows nothing of
     // earlier steals, nor of plans that never left the predecessor. 66597: nobody took the queue behind a job that had taken a
-    // thousand times what it should. Of the simulator, storm 194: a connection that broke before it stood was waited for.
+    // thousand times what it should. 93593: a second attempt ended first, and its application had lost its link to that node and
+    // sought the job at the other one for ever. Of the simulator, storm 194: a connection that broke before it stood was waited for.
     (
         "weather",
         &[
             78, 165, 305, 1_083, 2_376, 5_330, 6_521, 10_071, 10_284, 13_445, 17_727, 18_944, 20_267, 24_543,
-            35_007, 47_121, 47_627, 66_597, 68_965, 71_353, 73_278,
+            35_007, 47_121, 47_627, 66_597, 68_965, 71_353, 73_278, 93_593,
         ],
     ),
     // 17, 48, 143: an application that resumed without its memory was not told of jobs that had been executed, threw

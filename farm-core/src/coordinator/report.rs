@@ -126,10 +126,12 @@ impl CoordinatorMachine {
         }
     }
 
-    /// The second attempt ended first.
+    /// The second attempt ended first. Its application hears that this is the one that counts now: it may have lost its link to
+    /// the node meanwhile, and have given up what was only a second attempt.
     fn first_one_loses(&mut self, id: JobId) {
         let loser = self.holder(id);
         self.promote_backup(id);
+        self.repeat_plan(id.app, &[JobKey::of(id)]);
         if let Some((node, attempt)) = loser {
             self.tell_node(node, CoordinatorToNode::Cancel { jobs: vec![JobAttempt { job: id, attempt }] });
         }

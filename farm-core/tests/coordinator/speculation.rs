@@ -1,6 +1,6 @@
 //! Second attempts at the tail of a run: when they are made, and that one of the two always counts.
 
-use std::time::Duration;
+use std::{collections::BTreeMap, time::Duration};
 
 use farm_core::{id::JobAttempt, message::JobFailure};
 
@@ -66,6 +66,16 @@ fn the_first_result_cancels_the_other_attempt() {
         assert_eq!(farm.machine.status().delivered_jobs, delivered, "and counts for nothing");
         assert_eq!(farm.open_jobs(), 0);
     }
+}
+
+/// Seed 93593: the application had lost its link to the second node, and sought the job at the first one for ever.
+#[test]
+fn a_second_attempt_that_ends_first_is_told_to_be_the_one_that_counts() {
+    let (mut farm, first) = tail();
+    let second = backup(&mut farm, first);
+    let told = farm.ended(2, second, 10);
+    assert_eq!(told, BTreeMap::from([(2, vec![second])]));
+    assert!(!farm.speculative, "it takes the first one's place");
 }
 
 #[test]
