@@ -367,15 +367,16 @@ impl Driver {
     fn coordinator_lost(&mut self, error: SessionError) {
         tracing::warn!(%error, "the coordinator is lost, trying again");
         let address = self.options.coordinator.clone();
-        self.answer_registration(Err(match &error {
-            SessionError::Denied { reason } => FarmError::Denied { address, reason: reason.clone() },
-            error => FarmError::Unreachable { address, reason: error.to_string() },
-        }));
-        if let SessionError::Denied { reason } = &error {
+        let failure = || match &error {
+            SessionError::Denied { reason } => {
+                FarmError::Denied { address: address.clone(), reason: reason.clone() }
+            }
+            error => FarmError::Unreachable { address: address.clone(), reason: error.to_string() },
+        };
+        self.answer_registration(Err(failure()));
+        if matches!(error, SessionError::Denied { .. }) {
             // It is there, and will say the same again.
-            let denied =
-                || FarmError::Denied { address: self.options.coordinator.clone(), reason: reason.clone() };
-            self.runs.end_all(|| RunEnd::Farm(denied()));
+            self.runs.end_all(|| RunEnd::Farm(failure()));
         }
         self.coordinator.lost(&error, Instant::now());
         self.tell_ledger(Event::CoordinatorLost);

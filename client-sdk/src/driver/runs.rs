@@ -43,12 +43,6 @@ struct Waiting {
     since: Instant,
 }
 
-impl Waiting {
-    const fn tires(&self) -> bool {
-        tires(self.reason)
-    }
-}
-
 /// What the application's own project has in use it will have done with: that is no reason to give up.
 const fn tires(reason: WaitReason) -> bool {
     match reason {
@@ -149,7 +143,7 @@ impl Runs {
     /// A batch waits for a device.
     pub(super) fn waits(&mut self, batch: BatchId, task: TaskId, reason: WaitReason, now: Instant) {
         let wait = self.waits.entry(batch).or_insert(Waiting { task, reason, since: now });
-        if wait.tires() != tires(reason) {
+        if tires(wait.reason) != tires(reason) {
             // Only what tires counts for patience.
             wait.since = now;
         }
@@ -177,7 +171,7 @@ impl Runs {
     }
 
     pub(super) fn next_wake(&self) -> Option<Instant> {
-        let waits = self.waits.values().filter(|wait| wait.tires()).map(|wait| wait.since);
+        let waits = self.waits.values().filter(|wait| tires(wait.reason)).map(|wait| wait.since);
         let since = waits.chain(self.out_of_reach.as_ref().map(|out| out.since));
         since.filter_map(|since| since.checked_add(self.patience)).min()
     }
@@ -188,7 +182,7 @@ impl Runs {
         let mut tired = Vec::new();
         self.waits.retain(|_, wait| {
             let waited = now.saturating_duration_since(wait.since);
-            let waits_on = waited < patience || !wait.tires();
+            let waits_on = waited < patience || !tires(wait.reason);
             if !waits_on {
                 tired.push((wait.task, wait.reason, waited));
             }

@@ -101,31 +101,27 @@ pub(super) fn render(status: &FarmStatus) -> String {
 fn projects(page: &mut Page, status: &FarmStatus) {
     type Figure = fn(&ProjectStatus) -> f64;
     type Most = fn(&Quota) -> Option<f64>;
-    let families: [(&str, &str, &str, Figure, Most); 4] = [
+    let families: [(&str, &str, Figure, Most); 4] = [
         (
             "gleaner_project_devices",
-            "gleaner_project_devices_quota",
             "Devices that each project's jobs are on.",
             |project| project.devices as f64,
             |quota| quota.devices.map(f64::from),
         ),
         (
             "gleaner_project_queued_jobs",
-            "gleaner_project_queued_jobs_quota",
             "Jobs of each project that are planned and not delivered.",
             |project| project.queued_jobs as f64,
             |quota| quota.queued_jobs.map(|most| most as f64),
         ),
         (
             "gleaner_project_bytes",
-            "gleaner_project_bytes_quota",
             "Bytes of task data and modules of each project's planned jobs.",
             |project| project.bytes as f64,
             |quota| quota.bytes.map(|most| most as f64),
         ),
         (
             "gleaner_project_weight",
-            "gleaner_project_weight_quota",
             "What the fair-share weights of each project's applications come to.",
             |project| project.weight,
             |quota| quota.weight,
@@ -139,15 +135,16 @@ fn projects(page: &mut Page, status: &FarmStatus) {
     for project in &status.projects {
         page.sample("gleaner_project_waiting_jobs", &[("project", &project.project)], project.waiting_jobs);
     }
-    for (name, name_of_most, help, figure, most) in families {
+    for (name, help, figure, most) in families {
         page.family(name, "gauge", help);
         for project in &status.projects {
             page.sample(name, &[("project", &project.project)], figure(project));
         }
-        page.family(name_of_most, "gauge", "Its quota, of the projects that have one.");
+        let quota = format!("{name}_quota");
+        page.family(&quota, "gauge", "Its quota, of the projects that have one.");
         for project in &status.projects {
             if let Some(most) = most(&project.quota) {
-                page.sample(name_of_most, &[("project", &project.project)], most);
+                page.sample(&quota, &[("project", &project.project)], most);
             }
         }
     }

@@ -7,13 +7,11 @@ use std::{collections::BTreeSet, time::Duration};
 
 use super::{
     CoordinatorMachine, Effect,
-    model::Pending,
+    model::{Node, Pending},
+    neighbours::Place,
     policy::{Choice, Question, QuestionId},
 };
-use crate::{
-    id::{DeviceIndex, NodeId, TaskId},
-    time::Instant,
-};
+use crate::{id::TaskId, time::Instant};
 
 /// How long a plug-in may take for a batch, in milliseconds.
 const BUDGET_MS: u64 = 100;
@@ -89,14 +87,15 @@ impl CoordinatorMachine {
     /// Jobs that went meanwhile are left out; a device that went sends the whole batch back into line.
     fn place_as_answered(&mut self, now: Instant, asked: Asked, choices: &[Choice]) {
         let Asked { pending, question, .. } = asked;
-        let chosen: BTreeSet<u32> = choices.iter().map(|choice| choice.device).collect();
-        let stands = chosen.iter().all(|&position| {
-            let device = &question.devices[position as usize];
-            self.still_takes(now, &pending, device.node, device.device)
-        });
-        let devices = chosen.iter().map(|&position| &question.devices[position as usize]);
-        let devices = devices.map(|device| (device.node, device.device)).collect();
-        let within = self.is_within_quota(&pending, choices.len(), &devices);
+        let places: BTreeSet<Place> = choices
+            .iter()
+            .map(|choice| {
+                let device = &question.devices[choice.device as usize];
+                (device.node, device.device)
+            })
+            .collect();
+        let stands = places.iter().all(|&place| self.still_takes(now, &pending, place));
+        let within = self.is_within_quota(&pending, choices.len(), &places);
         let Some(app) = self.apps.get(&pending.app) else { return };
         if !stands || !within || app.link.is_none() {
             self.fresh.push_back(pending);
@@ -112,14 +111,14 @@ impl CoordinatorMachine {
         }
     }
 
-    fn still_takes(&self, now: Instant, pending: &Pending, node: NodeId, device: DeviceIndex) -> bool {
+    fn still_takes(&self, now: Instant, pending: &Pending, (node, index): Place) -> bool {
         let Some(app) = self.apps.get(&pending.app) else { return false };
-        let Some(node_state) = self.nodes.get(&node).filter(|node| node.takes_work()) else { return false };
-        let reachable = app.can_reach(now, node);
-        let device = node_state.devices.get(usize::from(device.0));
+        let takes_work = self.nodes.get(&node).is_some_and(Node::takes_work);
         let needs = app.batches.get(&pending.batch).map(|batch| batch.needs);
-        reachable
-            && device
+        takes_work
+            && app.can_reach(now, node)
+            && self
+                .device((node, index))
                 .zip(needs)
                 .is_some_and(|(device, needs)| !device.lost && needs.fulfilled_by(&device.info))
     }

@@ -7,8 +7,8 @@
 //! holds a learning policy's jobs back, `neighbours` says what they will cost), `inventory` (what nodes hold),
 //! `report` (what ended), `replan` (what was lost), `steal` (what moves between nodes), `speculate` (what runs twice at the tail),
 //! `breaker` (which application is stopped), `lease` (who is silent), `contents` (who has and brings which data), `durable` (what
-//! outlives it), `project` (what belongs together, and may have how much), `status` (what operators see), `timeline` (what ran when and where). `model` holds the state they share, `rates`
-//! what devices are worth.
+//! outlives it), `project` (what belongs together, and may have how much), `status` (what operators see), `timeline` (what ran when
+//! and where). `model` holds the state they share, `rates` what devices are worth.
 
 mod breaker;
 mod consult;

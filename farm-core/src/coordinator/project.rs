@@ -7,7 +7,7 @@ use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
 use super::{
     CoordinatorMachine, ProjectStatus,
-    model::{JobState, Pending, Placement},
+    model::{Batch, JobState, Pending, Placement},
     neighbours::Place,
     policy::{Question, QuestionDevice, QuestionJob},
 };
@@ -159,10 +159,13 @@ impl Projects {
         }
     }
 
-    /// A batch that counts is over.
-    pub(super) fn counts_no_more(&mut self, app: AppId, contents: &[Content]) {
+    /// A batch is over: if it counted, it does no more.
+    pub(super) fn batch_over(&mut self, app: AppId, batch: &Batch) {
+        if !batch.counted {
+            return;
+        }
         let Some((slot, project)) = self.project_of_mut(app) else { return };
-        for (hash, _) in distinct(contents) {
+        for (hash, _) in distinct(&batch.contents) {
             let Some((size_bytes, batches)) = project.contents.get_mut(&hash) else { continue };
             *batches -= 1;
             if *batches == 0 {

@@ -135,9 +135,7 @@ impl CoordinatorMachine {
         for (key, job) in app.jobs {
             self.release(id, key, job.state);
         }
-        for batch in app.batches.into_values().filter(|batch| batch.counted) {
-            self.projects.counts_no_more(id, &batch.contents);
-        }
+        app.batches.values().for_each(|batch| self.projects.batch_over(id, batch));
         self.app_leaves_project(id);
         self.forget_pending(|pending| pending.app == id);
         let nodes: Vec<NodeId> = self.nodes.keys().copied().collect();

@@ -7,7 +7,8 @@ use std::{
 
 use super::{
     CoordinatorMachine, NodeState,
-    model::{Job, JobState},
+    model::{Device, Job, JobState},
+    neighbours::Place,
 };
 use crate::{
     id::{AppId, Attempt, ContentHash, DeviceIndex, JobAttempt, JobId, JobKey, NodeId, NodeSession, TaskId},
@@ -258,9 +259,8 @@ impl CoordinatorMachine {
         if let Some(batch) = app.batches.get_mut(&job.batch) {
             batch.open_jobs -= 1;
             if batch.open_jobs == 0 {
-                let over = app.batches.remove(&job.batch);
-                if let Some(over) = over.filter(|over| over.counted) {
-                    self.projects.counts_no_more(id.app, &over.contents);
+                if let Some(over) = app.batches.remove(&job.batch) {
+                    self.projects.batch_over(id.app, &over);
                 }
                 let batch = job.batch;
                 self.forget_pending(|pending| pending.app == id.app && pending.batch == batch);
@@ -294,6 +294,10 @@ impl CoordinatorMachine {
 
     pub(super) fn job_mut(&mut self, id: JobId) -> Option<&mut Job> {
         self.apps.get_mut(&id.app)?.jobs.get_mut(&JobKey::of(id))
+    }
+
+    pub(super) fn device(&self, (node, index): Place) -> Option<&Device> {
+        self.nodes.get(&node)?.devices.get(usize::from(index.0))
     }
 
     pub(super) fn job(&self, id: JobId) -> Option<&Job> {

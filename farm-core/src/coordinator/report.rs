@@ -108,7 +108,7 @@ impl CoordinatorMachine {
                 }
             }
             Some(JobFailure::Returned) => {
-                if !self.drains(node) && !self.is_lost(node, device) {
+                if !self.drains(node) && !self.device((node, device)).is_some_and(|device| device.lost) {
                     self.node_full(now, node);
                 }
                 self.requeue(id, Some(node));
@@ -198,11 +198,6 @@ impl CoordinatorMachine {
             self.history.note(&app.name, job.index, point_ns);
         }
         self.keep_speeds(id, index);
-    }
-
-    fn is_lost(&self, id: NodeId, index: DeviceIndex) -> bool {
-        let device = self.nodes.get(&id).and_then(|node| node.devices.get(usize::from(index.0)));
-        device.is_some_and(|device| device.lost)
     }
 
     fn node_full(&mut self, now: Instant, id: NodeId) {

@@ -7,7 +7,7 @@
 
 use super::{
     CoordinatorMachine,
-    model::{Device, JobState, Pending},
+    model::{JobState, Pending},
     neighbours::{Estimates, Place},
     placement::{load_amount, told_load},
     policy::{History, LongestFirst, Packed, PlacementPolicy as _, Policy, Question},
@@ -149,10 +149,6 @@ impl CoordinatorMachine {
     /// It is placed before the current event is done with.
     fn next_part(&mut self, app: AppId, batch: BatchId) {
         self.fresh.extend(self.reserved.remove(&(app, batch)));
-    }
-
-    fn device(&self, (node, index): Place) -> Option<&Device> {
-        self.nodes.get(&node)?.devices.get(usize::from(index.0))
     }
 }
 

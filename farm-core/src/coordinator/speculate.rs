@@ -86,7 +86,7 @@ impl CoordinatorMachine {
 
     /// The running job that gains most from a second attempt on this device.
     fn straggler_for(&self, now: Instant, helper: NodeId, index: DeviceIndex) -> Option<Straggler> {
-        let device = self.nodes.get(&helper)?.devices.get(usize::from(index.0))?;
+        let device = self.device((helper, index))?;
         let running = self.nodes.iter().filter(|(id, _)| **id != helper).flat_map(|(_, node)| {
             node.devices.iter().filter_map(|device| device.running.map(|running| (node.last_heard, running)))
         });
@@ -133,7 +133,7 @@ impl CoordinatorMachine {
         if !self.modules.is_known(place.load.module) {
             return None;
         }
-        let device = self.nodes.get(&place.node)?.devices.get(usize::from(place.device.0))?;
+        let device = self.device((place.node, place.device))?;
         let whole_ns = place.load.amount as f64 / device.throughput.rate(&self.modules, place.load.module);
         Some(if elapsed_ns < whole_ns { whole_ns - elapsed_ns } else { elapsed_ns })
     }

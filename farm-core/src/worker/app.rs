@@ -137,15 +137,15 @@ impl WorkerMachine {
         app.drop_at = None;
         app.stays = stays;
         let entered = self.projects.entry(project.clone()).or_default();
+        let mut concerns_all = std::mem::replace(&mut entered.quota_bytes, result_bytes) != result_bytes;
         if app.project.replace(project).is_none() {
             entered.apps.insert(id);
             entered.spool_bytes += app.spool_bytes;
+            concerns_all |= app.spool_bytes > 0;
         }
-        let changed = std::mem::replace(&mut entered.quota_bytes, result_bytes) != result_bytes;
-        let settled = if changed { entered.apps.clone() } else { BTreeSet::from([id]) };
+        let concerned = if concerns_all { entered.apps.clone() } else { BTreeSet::from([id]) };
         self.lags.join(id, weight);
-        settled.into_iter().for_each(|app| self.settle_share(app));
-        self.settle_shares_with(id);
+        concerned.into_iter().for_each(|app| self.settle_share(app));
     }
 
     pub(super) fn takes_results(&self, id: AppId) -> bool {

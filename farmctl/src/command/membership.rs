@@ -154,7 +154,6 @@ pub(crate) async fn token(verb: &TokenVerb, target: &Target<'_>, format: Format)
                 MemberRole::App => Role::App,
                 MemberRole::Operator => Role::Operator,
             };
-            let (name, project) = (name.clone(), project.clone());
             let invitation = Invitation {
                 role,
                 name: name.clone(),
