@@ -237,8 +237,11 @@ impl RenderTask {
         let most_lights = Film::max_held_splats(self.shared.plan.size()) as u64;
         let mut jobs: Vec<Box<dyn Job>> = Vec::new();
         loop {
-            // One of those in flight has its turn; the film holds at most the rest.
-            let tile_room = self.cursor.tiles_out() - tiles_merged < MAX_HELD_TILES as u64;
+            // A tile's first layer never waits in the film. Of later ones in flight one has its turn; the film holds at most
+            // the rest.
+            let tiles_out = self.cursor.tiles_out();
+            let tile_room = tiles_out < u64::from(self.shared.plan.tiles())
+                || tiles_out - tiles_merged < MAX_HELD_TILES as u64;
             let light_room = u64::from(self.cursor.lights_out() - lights_merged) < most_lights;
             let Some(planned) = self.cursor.next(tile_room, light_room) else { return jobs };
             let shared = Arc::clone(&self.shared);
@@ -414,6 +417,26 @@ mod tests {
         }
         assert!(rounds > 3, "1,600 jobs do not fit into {rounds} windows");
         task.finish().expect("every job was made and merged");
+    }
+
+    #[test]
+    fn first_layers_go_out_at_once_and_later_ones_wait_for_room() {
+        // 540 tiles of one layer: the coordinator sees the whole image in one batch.
+        assert_eq!(render_task(1_920, 1_152, 64).next_jobs().len(), 540 + 16);
+        let mut task = render_task(1_920, 1_152, 512);
+        let plan = task.shared.plan;
+        assert_eq!((plan.tiles(), plan.slices()), (540, 2));
+        task.next_jobs();
+        assert_eq!(task.cursor.tiles_out(), 540);
+        let (turn, job) = plan.tile_job(539);
+        task.shared.film().add_tile(turn, tile_layer(&job)).unwrap();
+        assert!(task.next_jobs().is_empty(), "539 that are not there yet leave no room");
+        for number in 0..40 {
+            let (turn, job) = plan.tile_job(number);
+            task.shared.film().add_tile(turn, tile_layer(&job)).unwrap();
+        }
+        task.next_jobs();
+        assert_eq!(task.cursor.tiles_out() - 41, MAX_HELD_TILES as u64);
     }
 
     #[test]

@@ -6,6 +6,7 @@ use clap::{
     Args, Parser, Subcommand, ValueEnum,
     builder::{OsStringValueParser, TypedValueParser},
 };
+use farm_core::coordinator::policy::{FCFS, NEIGHBOURS};
 use mi_kernel::generate::RandomAlignment;
 
 use crate::{failure::Failure, target::Target};
@@ -158,7 +159,7 @@ pub(crate) struct RenderArgs {
     #[arg(long, default_value_t = 0.0, allow_negative_numbers = true, value_parser = stops)]
     pub exposure: f32,
     /// How the coordinator spreads the jobs: fcfs, neighbours, history, or the name of a plug-in of its own.
-    #[arg(long, value_name = "NAME", default_value = "fcfs")]
+    #[arg(long, value_name = "NAME", default_value = NEIGHBOURS)]
     pub policy: String,
     /// How progress is told.
     #[arg(long, value_enum, default_value_t = ProgressStyle::Auto)]
@@ -208,7 +209,7 @@ pub(crate) struct MiArgs {
     #[arg(long, value_name = "PAIRS")]
     pub top: Option<usize>,
     /// How the coordinator spreads the jobs: fcfs, neighbours, history, or the name of a plug-in of its own.
-    #[arg(long, value_name = "NAME", default_value = "fcfs")]
+    #[arg(long, value_name = "NAME", default_value = FCFS)]
     pub policy: String,
     /// How progress is told.
     #[arg(long, value_enum, default_value_t = ProgressStyle::Auto)]
