@@ -145,7 +145,8 @@ fn measure(bench: &mut Bench, arguments: &Arguments, set: &RandomAlignment) -> R
         .collect();
     contents.extend(extra);
     let mut job = |range: std::ops::Range<u64>| -> Result<(Duration, Vec<Bytes>), Box<dyn Error>> {
-        let pass = MiJob { seed: Seed(1), pass: Pass::Reduce(range) };
+        let pass = Pass::Reduce { iterations: range, chunks: 0..shape.chunks().len() };
+        let pass = MiJob { seed: Seed(1), pass };
         let mut program = JobProgram::default();
         pass.program(&shape, &named, &observed_names, &mut program)?;
         bench.run(program, &contents)

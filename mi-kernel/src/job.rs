@@ -5,7 +5,7 @@
 //! runs; integer sums make that invisible in the result.
 
 use std::{
-    collections::{BTreeSet, VecDeque},
+    collections::{BTreeMap, BTreeSet, VecDeque},
     iter,
     ops::Range,
     sync::{
@@ -21,7 +21,7 @@ use client_sdk::{
 use thiserror::Error;
 
 use crate::{
-    Accumulators, Alignment, Reference, ReferenceError, Seed,
+    Accumulators, Alignment, NullModelError, PairSums, Reference, ReferenceError, Seed,
     gpu::{AlignmentContents, MiJob, PackedAlignment, Pass, Shape, ShapeError, module_source},
     pair_count,
 };
@@ -57,7 +57,7 @@ const SUMS_BYTES_PER_S: f64 = 80e6;
 /// A job has at most this share of the iterations left, and a run's last ones this share of the others' length: devices that
 /// end at different times wait for a short job. Where results are large, twice what devices make else is the most.
 const LEFT_SHARE: u64 = 8;
-const SHORT_SHARE: u64 = 4;
+const SHORT_SHARE: u64 = 8;
 const SHORT_LARGE_SHARE: u64 = 2;
 
 /// What jobs bring back.
@@ -193,13 +193,15 @@ pub fn mi_graph(alignment: Arc<Alignment>, options: MiOptions) -> Result<(TaskGr
         contents: OnceLock::new(),
         observed: OnceLock::new(),
         observed_contents: OnceLock::new(),
+        parts: Mutex::new(BTreeMap::new()),
         sums: Mutex::new(sums),
         iterations_done: AtomicU64::new(earlier),
+        pair_iterations_done: AtomicU64::new(0),
         nodes: Mutex::new(BTreeSet::new()),
     });
     let needs = Requirements { simulated, ..Requirements::ANY };
     let observed = ObservedTask { needs, shared: Arc::clone(&shared) };
-    let null = NullTask { needs, remaining, lengths, earlier, seed, mode, shared: Arc::clone(&shared) };
+    let null = NullTask { needs, remaining, lengths, seed, mode, shared: Arc::clone(&shared) };
     let graph =
         TaskGraph::new().task(OBSERVED_TASK, observed).task(NULL_TASK, null).after(NULL_TASK, OBSERVED_TASK);
     Ok((graph, MiHandle { shared }))
@@ -210,7 +212,10 @@ pub fn mi_graph(alignment: Arc<Alignment>, options: MiOptions) -> Result<(TaskGr
 struct Lengths {
     mode: Mode,
     by: JobLengths,
+    /// Of all jobs over the same iterations.
     pairs: u64,
+    /// Jobs over the same iterations, each of a part of the pairs.
+    parts: u64,
     /// While nothing is known of the devices: long enough for a fast one, short enough that many share the run.
     first: u64,
     most: u64,
@@ -219,15 +224,18 @@ struct Lengths {
 impl Lengths {
     fn new(shape: &Shape, mode: Mode, by: JobLengths, iterations: u64) -> Self {
         let pairs = shape.pairs() as u64;
-        let long = JOB_COUNTS / (pairs * u64::from(shape.rows())).max(1);
-        let commands = JOB_COMMANDS / (4 + 3 * shape.chunks().len() as u64);
+        let parts = parts_of(shape, mode);
+        let chunks = parts.iter().map(Range::len).max().unwrap_or(1) as u64;
+        let parts = parts.len() as u64;
+        let long = JOB_COUNTS * parts / (pairs * u64::from(shape.rows())).max(1);
+        let commands = JOB_COMMANDS / (4 + 3 * chunks);
         let held = match mode {
             Mode::Reduce => JOB_ITERATIONS,
             Mode::Matrix => JOB_MATRIX_BYTES / (pairs * 4),
         };
         let most = JOB_ITERATIONS.min(commands).min(held).max(1);
-        let first = long.min(iterations.div_ceil(LEAST_JOBS)).clamp(1, most);
-        Self { mode, by, pairs, first, most }
+        let first = long.min((iterations * parts).div_ceil(LEAST_JOBS)).clamp(1, most);
+        Self { mode, by, pairs, parts, first, most }
     }
 
     /// Iterations of the next job, `left` being without one. `iteration_s` is what one took so far: where sums are large
@@ -241,18 +249,19 @@ impl Lengths {
     fn next(&self, left: u64, iteration_s: Option<f64>) -> u64 {
         let by_result = match (self.mode, self.by, iteration_s) {
             (Mode::Reduce, JobLengths::Measured, Some(iteration_s)) => {
-                (self.result_bytes(1) as f64 / (SUMS_BYTES_PER_S * iteration_s)) as u64
+                (self.result_bytes(1) as f64 * self.parts as f64 / (SUMS_BYTES_PER_S * iteration_s)) as u64
             }
             _ => 0,
         };
         let full = self.first.max(by_result).min(self.most);
         let short = self.first.div_ceil(SHORT_SHARE).max(by_result.min(self.most) / SHORT_LARGE_SHARE);
-        full.min(left.div_ceil(LEFT_SHARE)).max(short)
+        full.min((left * self.parts).div_ceil(LEFT_SHARE)).max(short)
     }
 
+    /// Bytes of one job's result.
     fn result_bytes(&self, iterations: u64) -> u64 {
         match self.mode {
-            Mode::Reduce => self.pairs * 20,
+            Mode::Reduce => self.pairs * 20 / self.parts,
             Mode::Matrix => self.pairs * 4 * iterations,
         }
     }
@@ -260,7 +269,15 @@ impl Lengths {
     /// How many jobs of so many iterations may be in flight.
     fn in_flight(&self, iterations: u64, measured: bool) -> u64 {
         let bytes = if measured { FLIGHT_BYTES } else { FIRST_FLIGHT_BYTES };
-        (bytes / self.result_bytes(iterations).max(1)).clamp(2, FLIGHT_JOBS)
+        (bytes / self.result_bytes(iterations).max(1)).clamp(2.max(self.parts), FLIGHT_JOBS)
+    }
+}
+
+/// The chunks of each job over the same iterations. Matrices are not split: their bytes are the same however they are.
+fn parts_of(shape: &Shape, mode: Mode) -> Vec<Range<usize>> {
+    match mode {
+        Mode::Reduce => shape.parts(),
+        Mode::Matrix => iter::once(0..shape.chunks().len()).collect(),
     }
 }
 
@@ -303,11 +320,17 @@ struct Shared {
     contents: OnceLock<AlignmentContents>,
     observed: OnceLock<Vec<i32>>,
     observed_contents: OnceLock<Vec<Content>>,
+    /// Sums of some of the pairs, by the first iteration that they are of, until those of the others are there: what a run is
+    /// stopped with has to be of the same iterations for all pairs. Jobs of the same iterations are dispatched together, so of
+    /// those in flight few wait. Held for one insertion.
+    parts: Mutex<BTreeMap<u64, Vec<PairSums>>>,
     /// A lock, not an owner with messages: jobs are retrieved on the run's own threads and must know that their sums
     /// were taken before they say so; the handle reads between two of them. Held for one merge or one copy.
     sums: Mutex<Accumulators>,
     /// Of the sums, for who must not wait for them.
     iterations_done: AtomicU64,
+    /// Iterations times pairs that jobs of this run brought, in the sums or not yet.
+    pair_iterations_done: AtomicU64,
     /// As `sums`; held for one insertion.
     nodes: Mutex<BTreeSet<NodeId>>,
 }
@@ -315,6 +338,24 @@ struct Shared {
 impl Shared {
     fn sums(&self) -> MutexGuard<'_, Accumulators> {
         self.sums.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Takes a job's sums.
+    fn take(&self, range: Range<u64>, sums: PairSums) -> Result<(), NullModelError> {
+        let iterations = range.end - range.start;
+        self.pair_iterations_done.fetch_add(iterations * sums.pairs() as u64, Ordering::Relaxed);
+        let all = {
+            let mut parts = self.parts.lock().unwrap_or_else(PoisonError::into_inner);
+            let there = parts.entry(range.start).or_default();
+            there.push(sums);
+            let complete = there.iter().map(PairSums::pairs).sum::<usize>() >= self.shape.pairs();
+            if complete { parts.remove(&range.start) } else { None }
+        };
+        if let Some(all) = all {
+            self.sums().merge_parts(all)?;
+            self.iterations_done.fetch_add(iterations, Ordering::Relaxed);
+        }
+        Ok(())
     }
 
     fn contents(&self) -> Result<&AlignmentContents, DispatchError> {
@@ -392,8 +433,6 @@ struct NullTask {
     needs: Requirements,
     remaining: Remaining,
     lengths: Lengths,
-    /// Iterations in the sums before the run.
-    earlier: u64,
     seed: Seed,
     mode: Mode,
     shared: Arc<Shared>,
@@ -402,23 +441,27 @@ struct NullTask {
 impl NullTask {
     fn next_jobs(&mut self, progress: &TaskProgress) -> Vec<Box<dyn Job>> {
         let iteration_s = self.iteration_s(progress);
+        let parts = parts_of(&self.shared.shape, self.mode);
         let mut in_flight = progress.jobs_known - progress.jobs_done;
         let mut jobs: Vec<Box<dyn Job>> = Vec::new();
         let mut left = self.remaining.left();
         while left > 0 {
             let length = self.lengths.next(left, iteration_s);
-            if in_flight >= self.lengths.in_flight(length, iteration_s.is_some()) {
+            if in_flight + parts.len() as u64 > self.lengths.in_flight(length, iteration_s.is_some()) {
                 break;
             }
             let Some(range) = self.remaining.take(length) else { break };
             left -= range.end - range.start;
-            in_flight += 1;
-            let pass = match self.mode {
-                Mode::Reduce => Pass::Reduce(range),
-                Mode::Matrix => Pass::Matrix(range),
-            };
-            let job = MiJob { seed: self.seed, pass };
-            jobs.push(Box::new(NullJob { job, shared: Arc::clone(&self.shared) }));
+            in_flight += parts.len() as u64;
+            jobs.extend(parts.iter().map(|chunks| -> Box<dyn Job> {
+                let (iterations, chunks) = (range.clone(), chunks.clone());
+                let pass = match self.mode {
+                    Mode::Reduce => Pass::Reduce { iterations, chunks },
+                    Mode::Matrix => Pass::Matrix(iterations),
+                };
+                let job = MiJob { seed: self.seed, pass };
+                Box::new(NullJob { job, shared: Arc::clone(&self.shared) })
+            }));
         }
         jobs
     }
@@ -426,9 +469,10 @@ impl NullTask {
     /// Measured device time of one iteration, over all devices.
     #[expect(clippy::cast_precision_loss, reason = "a mean")]
     fn iteration_s(&self, progress: &TaskProgress) -> Option<f64> {
-        let done = self.shared.iterations_done.load(Ordering::Relaxed) - self.earlier;
-        let mean_s = progress.device_time.as_secs_f64() / done as f64;
-        (done > 0 && mean_s > 0.0).then_some(mean_s)
+        let done =
+            self.shared.pair_iterations_done.load(Ordering::Relaxed) as f64 / self.lengths.pairs as f64;
+        let mean_s = progress.device_time.as_secs_f64() / done;
+        (done > 0.0 && mean_s > 0.0).then_some(mean_s)
     }
 }
 
@@ -482,10 +526,7 @@ impl Job for NullJob {
             .sums(&self.shared.shape, observed, &result.sections)
             .map_err(RetrieveError::application)?;
         self.shared.note(result.node);
-        let iterations = sums.iterations() as u64;
-        self.shared.sums().merge(sums).map_err(RetrieveError::application)?;
-        self.shared.iterations_done.fetch_add(iterations, Ordering::Relaxed);
-        Ok(())
+        self.shared.take(self.job.iterations(), sums).map_err(RetrieveError::application)
     }
 }
 
@@ -528,6 +569,36 @@ mod tests {
     }
 
     #[test]
+    fn iterations_count_once_the_sums_of_all_their_pairs_are_there() {
+        let alignment = Arc::new(parse(b"ACA\nACC\nGTA\nGTC\n").unwrap().alignment);
+        let reference = Reference::new(&alignment).unwrap();
+        let null = NullModel::new(&reference, Seed(1), ShuffleKind::Feistel);
+        let (_, handle) = mi_graph(Arc::clone(&alignment), options(5, None)).unwrap();
+        let part = |iterations: Range<u64>, places: Range<usize>| {
+            let all = null.run(iterations.clone()).unwrap();
+            let (sum, squares) =
+                (all.sum()[places.clone()].to_vec(), all.sum_of_squares()[places.clone()].to_vec());
+            let reached = all.at_least_observed()[places.clone()].to_vec();
+            // As a job would know them: over its own pairs.
+            let maxima = iterations.clone().map(|iteration| {
+                (iteration, null.scores(iteration)[places.clone()].iter().copied().max().unwrap())
+            });
+            let part =
+                PairSums::new(alignment.l(), places.start, sum, squares, reached, maxima.collect()).unwrap();
+            handle.shared.take(iterations, part)
+        };
+        part(2..5, 1..3).unwrap();
+        part(0..2, 0..1).unwrap();
+        assert_eq!((handle.iterations_done(), handle.sums().iterations()), (0, 0), "none is complete");
+        part(2..5, 0..1).unwrap();
+        assert_eq!((handle.iterations_done(), handle.sums() == null.run(2..5).unwrap()), (3, true));
+        part(0..2, 1..3).unwrap();
+        assert_eq!((handle.iterations_done(), handle.sums() == null.run(0..5).unwrap()), (5, true));
+        part(0..2, 0..1).unwrap();
+        assert_eq!(part(0..2, 1..3).unwrap_err(), NullModelError::Doubled { iteration: 0 });
+    }
+
+    #[test]
     fn first_jobs_fit_the_run_and_the_program() {
         let alignment = parse(b"ACA\nACC\nGTA\nGTC\n").unwrap().alignment;
         let shape = Shape::new(&alignment).unwrap();
@@ -545,7 +616,7 @@ mod tests {
     fn jobs_are_as_long_as_their_results_are_large_and_short_at_the_end() {
         // The thesis' second set on an H200: 252 MB of sums, 44 ms an iteration.
         let by = JobLengths::Measured;
-        let lengths = Lengths { mode: Mode::Reduce, by, pairs: 12_628_338, first: 3, most: 256 };
+        let lengths = Lengths { mode: Mode::Reduce, by, pairs: 12_628_338, parts: 1, first: 3, most: 256 };
         assert_eq!(lengths.next(10_000, None), 3);
         assert_eq!(lengths.next(10_000, Some(0.044)), 71);
         assert_eq!(lengths.next(400, Some(0.044)), 50);
@@ -557,5 +628,9 @@ mod tests {
         let matrices = Lengths { mode: Mode::Matrix, ..lengths };
         assert_eq!(matrices.next(10_000, Some(0.044)), 3, "twice the iterations are twice the bytes");
         assert_eq!((lengths.in_flight(71, false), lengths.in_flight(71, true)), (8, 34));
+        // In four parts: the same bytes, but a job has a quarter of them, and of the time.
+        let parts = Lengths { parts: 4, ..lengths };
+        assert_eq!((parts.next(10_000, Some(0.044)), parts.next(400, Some(0.044))), (71, 71));
+        assert_eq!((parts.in_flight(71, false), parts.in_flight(71, true)), (34, 136));
     }
 }

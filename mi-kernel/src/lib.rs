@@ -43,7 +43,7 @@ pub use self::{
     fixed_point::{FixedPoint, MAX_SCALE_BITS, log2_q57},
     formats::{Format, MAX_LINE_BYTES, Parsed, ParsingNotes, parse, parse_as},
     gaps::{GapMode, SCORE_BITS},
-    null_model::{Accumulators, NullModel, NullModelError, PairStatistics},
+    null_model::{Accumulators, NullModel, NullModelError, PairStatistics, PairSums},
     philox::philox4x32_10,
     reference::{PairIndex, Reference, ReferenceError, pair_count},
     shuffle::{FEISTEL_ROUNDS, Feistel, Seed, ShuffleKind},

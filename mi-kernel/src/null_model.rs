@@ -5,6 +5,7 @@
 
 use std::{collections::BTreeMap, ops::Range};
 
+use rayon::prelude::*;
 use thiserror::Error;
 
 use crate::{
@@ -41,7 +42,13 @@ pub enum NullModelError {
         /// Iterations that they are said to be of.
         iterations: usize,
     },
-    /// Sums of different alignments.
+    /// Parts of sums that are to be joined are of different iterations.
+    #[error("the sums of the pairs from place {place} are of other iterations than those before")]
+    OtherIterations {
+        /// The first of their pairs, in the order of [`PairIndex::place`].
+        place: usize,
+    },
+    /// Sums of different alignments, or not of all pairs.
     #[error("sums over {ours} pairs cannot take sums over {theirs}")]
     Pairs {
         /// Pairs here.
@@ -104,6 +111,72 @@ impl<'r, 'a> NullModel<'r, 'a> {
     }
 }
 
+/// Fewest pairs that are worth a core of their own.
+const PAIRS_A_CORE: usize = 1 << 15;
+
+/// Sums over iterations for consecutive pairs, in the order of [`PairIndex::place`]: what one job brings back.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct PairSums {
+    l: usize,
+    first_place: usize,
+    sum: Vec<i64>,
+    sum_of_squares: Vec<u64>,
+    at_least_observed: Vec<u32>,
+    /// The largest X of each iteration over these pairs.
+    maxima: BTreeMap<u64, i32>,
+}
+
+impl PairSums {
+    /// Sums of the pairs from `first_place` on of an alignment of `l` columns; `maxima` says which iterations they are of.
+    ///
+    /// # Errors
+    /// The parts are of unequal lengths or leave the alignment, or no iterations make such sums.
+    pub fn new(
+        l: usize,
+        first_place: usize,
+        sum: Vec<i64>,
+        sum_of_squares: Vec<u64>,
+        at_least_observed: Vec<u32>,
+        maxima: BTreeMap<u64, i32>,
+    ) -> Result<Self, NullModelError> {
+        for length in [sum_of_squares.len(), at_least_observed.len()] {
+            if length != sum.len() {
+                return Err(NullModelError::Pairs { ours: sum.len(), theirs: length });
+            }
+        }
+        let end = first_place.saturating_add(sum.len());
+        if end > pair_count(l) {
+            return Err(NullModelError::Pairs { ours: pair_count(l), theirs: end });
+        }
+        let iterations = maxima.len();
+        let impossible = (&sum, &sum_of_squares, &at_least_observed)
+            .into_par_iter()
+            .with_min_len(PAIRS_A_CORE)
+            .enumerate()
+            .filter(|(_, (sum, squares, reached))| !is_possible(**sum, **squares, **reached, iterations))
+            .map(|(at, _)| at)
+            .min();
+        if let Some(at) = impossible {
+            let pair = pair_at(l, first_place + at);
+            return Err(NullModelError::Impossible { i: pair.i, j: pair.j, iterations });
+        }
+        Ok(Self { l, first_place, sum, sum_of_squares, at_least_observed, maxima })
+    }
+
+    /// How many pairs they are of.
+    #[must_use]
+    pub fn pairs(&self) -> usize {
+        self.sum.len()
+    }
+}
+
+impl From<Accumulators> for PairSums {
+    fn from(all: Accumulators) -> Self {
+        let Accumulators { l, sum, sum_of_squares, at_least_observed, maxima } = all;
+        Self { l, first_place: 0, sum, sum_of_squares, at_least_observed, maxima }
+    }
+}
+
 /// Sums over iterations for all pairs, in the order of [`PairIndex::place`].
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Accumulators {
@@ -146,14 +219,9 @@ impl Accumulators {
                 return Err(NullModelError::Pairs { ours: pairs, theirs: length });
             }
         }
-        let sums = Self { l, sum, sum_of_squares, at_least_observed, maxima };
-        match (0..pairs).find(|place| !sums.is_possible(*place)) {
-            None => Ok(sums),
-            Some(place) => {
-                let pair = sums.pair(place);
-                Err(NullModelError::Impossible { i: pair.i, j: pair.j, iterations: sums.iterations() })
-            }
-        }
+        let PairSums { sum, sum_of_squares, at_least_observed, maxima, .. } =
+            PairSums::new(l, 0, sum, sum_of_squares, at_least_observed, maxima)?;
+        Ok(Self { l, sum, sum_of_squares, at_least_observed, maxima })
     }
 
     /// Adds one iteration's scores.
@@ -184,18 +252,71 @@ impl Accumulators {
     /// # Errors
     /// An iteration is in both, the alignments differ, or a sum leaves 64 bits; the sums are then not to be used any more.
     pub fn merge(&mut self, other: Self) -> Result<(), NullModelError> {
-        if other.sum.len() != self.sum.len() {
-            return Err(NullModelError::Pairs { ours: self.sum.len(), theirs: other.sum.len() });
+        self.merge_parts(vec![other.into()])
+    }
+
+    /// Takes in the sums of other iterations, the same for all parts, which together are of all pairs. The order of parts and of
+    /// merging does not matter.
+    ///
+    /// # Errors
+    /// A pair is missing or in two parts, parts are of different iterations, an iteration is in already, the alignments differ, or
+    /// a sum leaves 64 bits; the sums are then not to be used any more.
+    pub fn merge_parts(&mut self, mut parts: Vec<PairSums>) -> Result<(), NullModelError> {
+        parts.sort_by_key(|part| part.first_place);
+        let mut covered = 0;
+        for part in &parts {
+            if part.l != self.l || part.first_place != covered {
+                break;
+            }
+            covered += part.pairs();
         }
-        if let Some(iteration) = other.maxima.keys().find(|iteration| self.maxima.contains_key(iteration)) {
+        let named: usize = parts.iter().map(PairSums::pairs).sum();
+        if covered != self.sum.len() || named != covered {
+            return Err(NullModelError::Pairs { ours: self.sum.len(), theirs: named });
+        }
+        let Some(first) = parts.first() else { return Ok(()) };
+        if let Some(iteration) = first.maxima.keys().find(|iteration| self.maxima.contains_key(iteration)) {
             return Err(NullModelError::Doubled { iteration: *iteration });
         }
-        self.maxima.extend(&other.maxima);
-        for place in 0..other.sum.len() {
-            let reached = other.at_least_observed[place];
-            self.add_at(place, other.sum[place], other.sum_of_squares[place], reached)?;
+        if let Some(other) = parts.iter().find(|part| !part.maxima.keys().eq(first.maxima.keys())) {
+            return Err(NullModelError::OtherIterations { place: other.first_place });
         }
-        Ok(())
+        for part in &parts {
+            for (&iteration, &largest) in &part.maxima {
+                self.maxima.entry(iteration).and_modify(|x| *x = largest.max(*x)).or_insert(largest);
+            }
+        }
+        let overflown = parts.iter().find_map(|part| self.add_part(part));
+        overflown.map_or(Ok(()), |place| Err(self.overflow(place)))
+    }
+
+    /// Adds sums to those of the same pairs. Gives the first pair whose sums leave their integers.
+    fn add_part(&mut self, part: &PairSums) -> Option<usize> {
+        let places = part.first_place..part.first_place + part.pairs();
+        let ours = (
+            &mut self.sum[places.clone()],
+            &mut self.sum_of_squares[places.clone()],
+            &mut self.at_least_observed[places.clone()],
+        );
+        let theirs = (&part.sum, &part.sum_of_squares, &part.at_least_observed);
+        (ours.0, ours.1, ours.2, theirs.0, theirs.1, theirs.2)
+            .into_par_iter()
+            .with_min_len(PAIRS_A_CORE)
+            .zip(places)
+            .filter_map(|((sum, squares, reached, more, more_squares, more_reached), place)| {
+                let sums = sum
+                    .checked_add(*more)
+                    .zip(squares.checked_add(*more_squares))
+                    .zip(reached.checked_add(*more_reached));
+                match sums {
+                    Some(added) => {
+                        ((*sum, *squares), *reached) = added;
+                        None
+                    }
+                    None => Some(place),
+                }
+            })
+            .min()
     }
 
     /// Number of iterations summed.
@@ -290,23 +411,21 @@ impl Accumulators {
         Ok(())
     }
 
-    /// Cauchy-Schwarz: (sum of X)^2 <= iterations * (sum of X^2). [`moments`] takes the root of the difference.
-    fn is_possible(&self, place: usize) -> bool {
-        let runs = self.iterations() as u128;
-        let square = u128::from(self.sum[place].unsigned_abs()).pow(2);
-        square <= u128::from(self.sum_of_squares[place]) * runs
-            && (runs > 0 || self.sum_of_squares[place] == 0)
-            && u128::from(self.at_least_observed[place]) <= runs
-    }
-
-    fn pair(&self, place: usize) -> PairIndex {
-        PairIndex::all(self.l).nth(place).expect("the place is of a pair")
-    }
-
     fn overflow(&self, place: usize) -> NullModelError {
-        let pair = self.pair(place);
+        let pair = pair_at(self.l, place);
         NullModelError::Overflow { i: pair.i, j: pair.j, iterations: self.iterations() }
     }
+}
+
+fn pair_at(l: usize, place: usize) -> PairIndex {
+    PairIndex::all(l).nth(place).expect("the place is of a pair")
+}
+
+/// Cauchy-Schwarz: (sum of X)^2 <= iterations * (sum of X^2). [`moments`] takes the root of the difference.
+fn is_possible(sum: i64, squares: u64, reached: u32, iterations: usize) -> bool {
+    let runs = iterations as u128;
+    let square = u128::from(sum.unsigned_abs()).pow(2);
+    square <= u128::from(squares) * runs && (runs > 0 || squares == 0) && u128::from(reached) <= runs
 }
 
 /// Mean and population standard deviation, from exact integers up to the last division.
@@ -383,6 +502,33 @@ mod tests {
             let iterations = usize::try_from(runs).unwrap();
             assert_eq!(error, NullModelError::Impossible { i: 0, j: 2, iterations }, "{case}");
         }
+    }
+
+    #[test]
+    fn parts_that_are_not_all_pairs_of_the_same_iterations_are_refused() {
+        let part = |first_place, sum: &[i64], iterations: Range<u64>| {
+            let squares = sum.iter().map(|x| x.unsigned_abs().pow(2)).collect();
+            let maxima =
+                iterations.map(|iteration| (iteration, 4 + i32::try_from(first_place).unwrap())).collect();
+            PairSums::new(3, first_place, sum.to_vec(), squares, vec![0; sum.len()], maxima).unwrap()
+        };
+        let merged = |parts: Vec<PairSums>| {
+            let mut sums = Accumulators::new(3);
+            sums.merge_parts(parts).map(|()| sums)
+        };
+        let whole = merged(vec![part(1, &[2, 3], 0..1), part(0, &[1], 0..1)]).unwrap();
+        assert_eq!((whole.sum(), &whole.maxima()[&0]), (&[1, 2, 3][..], &5), "the largest of both");
+        let error = |parts| merged(parts).unwrap_err();
+        let hole = NullModelError::Pairs { ours: 3, theirs: 2 };
+        assert_eq!(error(vec![part(0, &[1], 0..1), part(2, &[3], 0..1)]), hole);
+        let twice = NullModelError::Pairs { ours: 3, theirs: 4 };
+        assert_eq!(error(vec![part(0, &[1, 2], 0..1), part(1, &[2, 3], 0..1)]), twice);
+        assert_eq!(error(Vec::new()), NullModelError::Pairs { ours: 3, theirs: 0 });
+        let other = NullModelError::OtherIterations { place: 1 };
+        assert_eq!(error(vec![part(0, &[1], 0..1), part(1, &[2, 3], 1..2)]), other);
+        assert_eq!(error(vec![part(0, &[1], 0..1), part(1, &[2, 3], 0..2)]), other);
+        let beyond = PairSums::new(3, 2, vec![0; 2], vec![0; 2], vec![0; 2], BTreeMap::new()).unwrap_err();
+        assert_eq!(beyond, NullModelError::Pairs { ours: 3, theirs: 4 });
     }
 
     #[test]

@@ -3,6 +3,7 @@
 use std::io::{self, Write};
 
 use image::{ExtendedColorType, ImageEncoder, ImageError, codecs::png::PngEncoder};
+use rayon::prelude::*;
 
 use crate::{Alignment, PairStatistics, Reference};
 
@@ -71,7 +72,7 @@ pub fn write_top_pairs(
 ) -> io::Result<()> {
     let means = ColumnMeans::new(alignment.l(), pairs);
     let mut order: Vec<&PairStatistics> = pairs.iter().collect();
-    order.sort_by(|a, b| {
+    order.par_sort_unstable_by(|a, b| {
         b.z.total_cmp(&a.z).then(b.mi_bits.total_cmp(&a.mi_bits)).then((a.i, a.j).cmp(&(b.i, b.j)))
     });
     writeln!(out, "i,a_i,j,a_j,separation,mi_bits,null_mean_bits,null_sd_bits,z,p,mi_apc_bits,z_undefined")?;

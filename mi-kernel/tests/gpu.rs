@@ -4,11 +4,11 @@
 
 mod device;
 
-use std::time::Duration;
+use std::{ops::Range, time::Duration};
 
 use device::Device;
 use mi_kernel::{
-    Alignment, GapMode, NullModel, Reference, Seed, ShuffleKind,
+    Accumulators, Alignment, GapMode, NullModel, Reference, Seed, ShuffleKind,
     gpu::{Method, MiJob, Pass, Shape},
     parse,
 };
@@ -37,8 +37,9 @@ fn alignment(n: usize, l: usize, kinds: usize, mut state: u64) -> Alignment {
     parse(&text).unwrap().alignment
 }
 
-fn reduce(seed: u64, iterations: std::ops::Range<u64>) -> MiJob {
-    MiJob { seed: Seed(seed), pass: Pass::Reduce(iterations) }
+fn reduce(shape: &Shape, seed: u64, iterations: Range<u64>) -> MiJob {
+    let chunks = 0..shape.chunks().len();
+    MiJob { seed: Seed(seed), pass: Pass::Reduce { iterations, chunks } }
 }
 
 #[test]
@@ -53,7 +54,7 @@ fn random_alignments_give_the_hosts_bits() {
         prop_assert_eq!(device.observed(&reference, &shape), reference.observed(), "observed");
         let host =
             NullModel::new(&reference, Seed(seed), ShuffleKind::Feistel).run(first..first + 3).unwrap();
-        let sums = device.sums(&reference, &shape, &reduce(seed, first..first + 3));
+        let sums = device.sums(&reference, &shape, &reduce(&shape, seed, first..first + 3));
         prop_assert!(sums == host, "reduce");
         let matrix = MiJob { seed: Seed(seed), pass: Pass::Matrix(first..first + 3) };
         prop_assert!(device.sums(&reference, &shape, &matrix) == host, "matrix summed is reduce");
@@ -75,7 +76,10 @@ fn gaps_that_stand_apart_give_the_hosts_bits() {
             let shape = Shape::with_binding_bytes(&alignment, 20_000).unwrap();
             assert_eq!(device.observed(&reference, &shape), reference.observed(), "{gaps:?}, {n} x {l}");
             let host = NullModel::new(&reference, Seed(seed), ShuffleKind::Feistel).run(0..3).unwrap();
-            assert!(device.sums(&reference, &shape, &reduce(seed, 0..3)) == host, "{gaps:?}, {n} x {l}");
+            assert!(
+                device.sums(&reference, &shape, &reduce(&shape, seed, 0..3)) == host,
+                "{gaps:?}, {n} x {l}"
+            );
             seen.push(host);
         }
         assert!(seen[0] != seen[1] && seen[1] != seen[2], "the ways differ: {n} x {l}");
@@ -104,9 +108,12 @@ fn bit_planes_and_histograms_agree() {
         assert!(shape.chunks().len() > 1, "several bindings");
         let host = NullModel::new(&reference, Seed(4), ShuffleKind::Feistel).run(5..7).unwrap();
         assert!(device.observed(&reference, &shape) == reference.observed(), "{q} symbols, observed");
-        assert!(device.sums(&reference, &shape, &reduce(4, 5..7)) == host, "{q} symbols");
+        assert!(device.sums(&reference, &shape, &reduce(&shape, 4, 5..7)) == host, "{q} symbols");
         let histograms = shape.with_histograms();
-        assert!(device.sums(&reference, &histograms, &reduce(4, 5..7)) == host, "{q} symbols, histograms");
+        assert!(
+            device.sums(&reference, &histograms, &reduce(&histograms, 4, 5..7)) == host,
+            "{q} symbols, histograms"
+        );
     }
 }
 
@@ -122,9 +129,39 @@ fn several_blocks_chunks_and_cuts_do_not_show() {
     let host = NullModel::new(&reference, Seed(9), ShuffleKind::Feistel).run(7..9).unwrap();
     let coarse = Device::open(COARSE);
     assert!(coarse.observed(&reference, &chunked) == reference.observed(), "chunks show in observed scores");
-    assert!(coarse.sums(&reference, &whole, &reduce(9, 7..9)) == host, "one binding");
+    assert!(coarse.sums(&reference, &whole, &reduce(&whole, 9, 7..9)) == host, "one binding");
+    // Jobs of a part of the pairs each, as large alignments have them.
+    let mut parts = Accumulators::new(alignment.l());
+    let middle = 1..chunked.chunks().len() - 1;
+    let of_chunks = [0..1, middle.clone(), middle.end..middle.end + 1].map(|chunks| {
+        let job = MiJob { seed: Seed(9), pass: Pass::Reduce { iterations: 7..9, chunks } };
+        coarse.part(&reference, &chunked, &job)
+    });
+    parts.merge_parts(of_chunks.into()).unwrap();
+    assert!(parts == host, "jobs of some of the pairs");
     let fine = Device::open(Duration::from_millis(1));
-    assert!(fine.sums(&reference, &chunked, &reduce(9, 7..9)) == host, "many bindings, many cuts");
+    assert!(fine.sums(&reference, &chunked, &reduce(&chunked, 9, 7..9)) == host, "many bindings, many cuts");
+}
+
+#[test]
+fn large_alignments_come_in_parts_of_their_pairs() {
+    // 73 MB of sums.
+    let alignment = alignment(6, 2_700, 7, 8);
+    let reference = Reference::new(&alignment).unwrap();
+    let shape = Shape::new(&alignment).unwrap();
+    let parts = shape.parts();
+    assert_eq!(parts, [0..1, 1..2]);
+    let [first, second] = [0, 1].map(|part: usize| shape.pairs_of(parts[part].clone()));
+    assert_eq!(first + second, shape.pairs());
+    assert!(first.abs_diff(second) <= 2 * alignment.l(), "{first} and {second} pairs");
+    let device = Device::open(COARSE);
+    let of_parts = parts.into_iter().map(|chunks| {
+        let job = MiJob { seed: Seed(3), pass: Pass::Reduce { iterations: 1..3, chunks } };
+        device.part(&reference, &shape, &job)
+    });
+    let mut sums = Accumulators::new(alignment.l());
+    sums.merge_parts(of_parts.collect()).unwrap();
+    assert!(sums == NullModel::new(&reference, Seed(3), ShuffleKind::Feistel).run(1..3).unwrap());
 }
 
 #[test]
@@ -133,15 +170,21 @@ fn jobs_of_any_size_merge_to_the_same_and_another_seed_does_not() {
     let alignment = alignment(50, 9, 5, 3);
     let reference = Reference::new(&alignment).unwrap();
     let shape = Shape::new(&alignment).unwrap();
-    let at_once = device.sums(&reference, &shape, &reduce(1, 0..11));
-    let mut merged = device.sums(&reference, &shape, &reduce(1, 8..11));
+    let at_once = device.sums(&reference, &shape, &reduce(&shape, 1, 0..11));
+    let mut merged = device.sums(&reference, &shape, &reduce(&shape, 1, 8..11));
     for part in [0..1, 5..8, 1..5] {
-        merged.merge(device.sums(&reference, &shape, &reduce(1, part))).unwrap();
+        merged.merge(device.sums(&reference, &shape, &reduce(&shape, 1, part))).unwrap();
     }
     assert!(merged == at_once, "the split shows");
     // Negative controls: what must differ does.
-    assert!(device.sums(&reference, &shape, &reduce(2, 0..11)) != at_once, "the seed does not matter");
-    assert!(device.sums(&reference, &shape, &reduce(1, 1..12)) != at_once, "the iterations do not matter");
+    assert!(
+        device.sums(&reference, &shape, &reduce(&shape, 2, 0..11)) != at_once,
+        "the seed does not matter"
+    );
+    assert!(
+        device.sums(&reference, &shape, &reduce(&shape, 1, 1..12)) != at_once,
+        "the iterations do not matter"
+    );
 }
 
 #[test]

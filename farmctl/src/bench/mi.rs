@@ -18,6 +18,8 @@ use crate::{
     process_farm::{ProcessFarm, Shape, Stealing},
 };
 
+/// Iterations before the clock starts, for each device: jobs of one each, so many that each device gets some.
+const WARM_UP_ITERATIONS: u64 = 8;
 /// Parts of the iterations asked for that figure 5.6 is drawn over.
 const PARTS: [u64; 4] = [8, 4, 2, 1];
 /// Nodes and devices a node of figure 5.8.
@@ -82,8 +84,8 @@ async fn on_devices(setup: &Setup<'_>, alignment: &Arc<Alignment>) -> anyhow::Re
     for count in counts(setup.devices.len()) {
         let shape = Shape { workers: vec![setup.devices[..count].to_vec()], local_stealing: Stealing::On };
         let farm = start_farm(&shape)?;
-        // Contents are there, and kernels compiled.
-        run(&farm, setup, alignment, count as u64).await?;
+        // Every device has the contents and the compiled kernels.
+        run(&farm, setup, alignment, WARM_UP_ITERATIONS * count as u64).await?;
         for (part, alone_s) in parts.iter().zip(&mut alone_s) {
             let iterations = (setup.iterations / part).max(1);
             let (seconds, _) = median_run(&farm, setup, alignment, iterations).await?;

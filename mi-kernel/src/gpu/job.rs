@@ -13,7 +13,7 @@ use super::{
     layout::{self, KEYS_HEADER, LANES, ROWS_A_LANE, WORDS_A_LANE, binding},
     pack::{AlignmentContents, Chunk, Method, Shape},
 };
-use crate::{Accumulators, NullModelError, Seed, philox::split};
+use crate::{Accumulators, NullModelError, PairSums, Seed, philox::split};
 
 /// Most iterations of one job: its commands stay below the farm's quota of 4,096.
 const MAX_ITERATIONS: u64 = 512;
@@ -26,8 +26,13 @@ const COUNTS_A_NS: u64 = 1_000;
 pub enum Pass {
     /// Scores of the alignment as it is.
     Observed,
-    /// Sums over a range of iterations (`reduce` mode).
-    Reduce(Range<u64>),
+    /// Sums over a range of iterations, for the pairs of some consecutive chunks (`reduce` mode).
+    Reduce {
+        /// Which iterations.
+        iterations: Range<u64>,
+        /// Positions in [`Shape::chunks`]; the shape's [`Shape::parts`] are such ranges.
+        chunks: Range<usize>,
+    },
     /// All scores of each iteration of a range (`matrix` mode).
     Matrix(Range<u64>),
 }
@@ -72,7 +77,7 @@ impl MiJob {
     /// [`Pass::Reduce`] reads it.
     ///
     /// # Errors
-    /// No iteration, more than a program holds, or contents of another shape.
+    /// No iteration, no chunk, more than a program holds, or contents of another shape.
     pub fn program(
         &self,
         shape: &Shape,
@@ -81,22 +86,23 @@ impl MiJob {
         cmd: &mut JobProgram,
     ) -> Result<(), DispatchError> {
         let iterations = self.iterations();
+        let (first, chunks) = self.chunks(shape);
         let count = iterations.end.saturating_sub(iterations.start);
-        let commands = count * (4 + 3 * shape.chunks.len() as u64);
-        if count == 0 || count > MAX_ITERATIONS || commands > 3_500 {
-            let reason = format!("{count} iterations over {} chunks in one job", shape.chunks.len());
+        let commands = count * (4 + 3 * chunks.len() as u64);
+        if count == 0 || chunks.is_empty() || count > MAX_ITERATIONS || commands > 3_500 {
+            let reason = format!("{count} iterations over {} chunks in one job", chunks.len());
             return Err(DispatchError::Application(reason));
         }
-        let observed_fit = observed.len() == shape.chunks.len() || !matches!(self.pass, Pass::Reduce(_));
+        let observed_fit = observed.len() == shape.chunks.len() || !matches!(self.pass, Pass::Reduce { .. });
         if contents.orders.len() != shape.chunks.len() || !observed_fit {
             return Err(DispatchError::Application("contents of another shape".to_owned()));
         }
-        let passes = Passes::new(shape, contents, cmd)?;
+        let passes = Passes::new(shape, chunks, contents, cmd)?;
         let maxima = cmd.malloc(count * 4)?;
-        let mut counters = Vec::with_capacity(shape.chunks.len());
-        for (index, chunk) in shape.chunks.iter().enumerate() {
+        let mut counters = Vec::with_capacity(chunks.len());
+        for (index, chunk) in (first..).zip(chunks) {
             counters.push(match self.pass {
-                Pass::Reduce(_) => {
+                Pass::Reduce { .. } => {
                     passes.reduce(shape, contents, (index, *chunk), observed[index], maxima, cmd)?
                 }
                 Pass::Observed | Pass::Matrix(_) => passes.matrix(shape, contents, (index, *chunk), cmd)?,
@@ -130,45 +136,48 @@ impl MiJob {
                 cmd.memcpy_dtoh(reached, 0, pairs * 4)?;
             }
         }
-        if let Pass::Reduce(_) = self.pass {
+        if let Pass::Reduce { .. } = self.pass {
             cmd.memcpy_dtoh(maxima, 0, count * 4)?;
         }
         Ok(())
     }
 
-    /// The sums in the result of a [`Pass::Reduce`] or [`Pass::Matrix`]; `observed` holds the observed scores.
+    /// The sums in the result of a [`Pass::Reduce`] (of its chunks' pairs) or [`Pass::Matrix`] (of all); `observed` holds the
+    /// observed scores.
     ///
     /// # Errors
-    /// The sections are not those that the program asks for.
+    /// The sections are not those that the program asks for, or no iterations make such sums.
     pub fn sums<B: AsRef<[u8]>>(
         &self,
         shape: &Shape,
         observed: &[i32],
         sections: &[B],
-    ) -> Result<Accumulators, DecodeError> {
+    ) -> Result<PairSums, DecodeError> {
         let l = shape.l as usize;
-        let Pass::Reduce(iterations) = &self.pass else {
+        let Pass::Reduce { iterations, .. } = &self.pass else {
             let mut sums = Accumulators::new(l);
             for (iteration, scores) in self.iterations().zip(self.scores(shape, sections)?) {
                 sums.add(iteration, &scores, observed)?;
             }
-            return Ok(sums);
+            return Ok(sums.into());
         };
-        let expected = shape.chunks.len() * 3 + 1;
+        let (_, chunks) = self.chunks(shape);
+        let expected = chunks.len() * 3 + 1;
         if sections.len() != expected {
             return Err(DecodeError::SectionCount { expected, got: sections.len() });
         }
         let (mut sum, mut squares, mut reached) = (Vec::new(), Vec::new(), Vec::new());
-        for (index, chunk) in shape.chunks.iter().enumerate() {
+        for (index, chunk) in chunks.iter().enumerate() {
             let pairs = chunk.pairs as usize;
-            sum.extend(section::<i64, B>(sections, index * 3, pairs)?);
-            squares.extend(section::<u64, B>(sections, index * 3 + 1, pairs)?);
-            reached.extend(section::<u32, B>(sections, index * 3 + 2, pairs)?);
+            append(&mut sum, section(sections, index * 3, pairs)?);
+            append(&mut squares, section(sections, index * 3 + 1, pairs)?);
+            append(&mut reached, section(sections, index * 3 + 2, pairs)?);
         }
         let count = iterations.clone().count();
         let maxima = section::<u32, B>(sections, expected - 1, count)?;
         let maxima = iterations.clone().zip(maxima.into_iter().map(|word| (word ^ (1 << 31)).cast_signed()));
-        Ok(Accumulators::from_parts(l, sum, squares, reached, maxima.collect())?)
+        let first_place = chunks.first().map_or(0, |chunk| chunk.first_place as usize);
+        Ok(PairSums::new(l, first_place, sum, squares, reached, maxima.collect())?)
     }
 
     /// All scores in the result of a [`Pass::Observed`] or [`Pass::Matrix`], one vector an iteration.
@@ -203,10 +212,21 @@ impl MiJob {
         CostNs((u64::from(shape.n) * shape.pairs() as u64 / COUNTS_A_NS + 1).saturating_mul(iterations))
     }
 
-    fn iterations(&self) -> Range<u64> {
+    /// Which iterations it is of; the observed scores are none's, and count as the first.
+    pub(crate) fn iterations(&self) -> Range<u64> {
         match &self.pass {
             Pass::Observed => 0..1,
-            Pass::Reduce(iterations) | Pass::Matrix(iterations) => iterations.clone(),
+            Pass::Reduce { iterations, .. } | Pass::Matrix(iterations) => iterations.clone(),
+        }
+    }
+
+    /// The chunks that it is of, after the position of the first; none if the shape has no such chunks.
+    fn chunks<'shape>(&self, shape: &'shape Shape) -> (usize, &'shape [Chunk]) {
+        match &self.pass {
+            Pass::Observed | Pass::Matrix(_) => (0, &shape.chunks),
+            Pass::Reduce { chunks, .. } => {
+                (chunks.start, shape.chunks.get(chunks.clone()).unwrap_or_default())
+            }
         }
     }
 }
@@ -222,6 +242,15 @@ fn section<T: bytemuck::Pod, B: AsRef<[u8]>>(
         return Err(DecodeError::SectionSize { section: index, expected, got: bytes.len() });
     }
     Ok(pod_collect_to_vec(bytes))
+}
+
+/// A copy only where there is something to append to.
+fn append<T: Copy>(all: &mut Vec<T>, more: Vec<T>) {
+    if all.is_empty() {
+        *all = more;
+    } else {
+        all.extend_from_slice(&more);
+    }
 }
 
 /// The kernels and buffers that all chunks share.
@@ -240,7 +269,12 @@ enum Rows {
 }
 
 impl Passes {
-    fn new(shape: &Shape, contents: &AlignmentContents, cmd: &mut JobProgram) -> Result<Self, DispatchError> {
+    fn new(
+        shape: &Shape,
+        chunks: &[Chunk],
+        contents: &AlignmentContents,
+        cmd: &mut JobProgram,
+    ) -> Result<Self, DispatchError> {
         let sizes = shape.sizes();
         let round_keys = cmd.malloc((KEYS_HEADER + u64::from(shape.l) * 8) * 4)?;
         let keys = cmd.function(contents.module, "keys");
@@ -248,7 +282,7 @@ impl Passes {
         cmd.memcpy_htod(keys, "sizes", bytes_of(&sizes))?;
         let (rows, shuffle) = match shape.method {
             Method::Histograms => {
-                let widest = shape.chunks.iter().map(|chunk| chunk.columns).max().unwrap_or(1);
+                let widest = chunks.iter().map(|chunk| chunk.columns).max().unwrap_or(1);
                 let shuffled = cmd.malloc(u64::from(shape.n) * u64::from(sizes.row_words) * 4)?;
                 let grouped = cmd.malloc(u64::from(widest) * u64::from(sizes.order_words) * 4)?;
                 let shuffle = cmd.function(contents.module, "shuffle");

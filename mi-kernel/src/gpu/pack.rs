@@ -1,8 +1,9 @@
 //! An alignment's bytes as kernels bind them, and how its pairs are split over bindings.
 
-use std::{num::NonZero, thread};
+use std::ops::Range;
 
 use farm_core::program::Content;
+use rayon::prelude::*;
 use thiserror::Error;
 
 use super::layout::{BLOCK_COLUMNS, ChunkRange, Sizes};
@@ -19,6 +20,11 @@ const RESULT_BYTES: u64 = 1 << 30;
 
 /// Bytes of a pair's accumulators: sum, sum of squares, count.
 const PAIR_BYTES: u64 = 20;
+
+/// Most bytes of the sums of one part of the pairs. Where all pairs have more, a job is of one part: for the same bytes over
+/// the network it has as many times more iterations, and at the end of a run devices wait for less. Each part shuffles anew,
+/// some hundredths of a part's work.
+const PART_BYTES: u64 = 64 << 20;
 
 /// Alphabets that bit planes are made for.
 pub(super) const PLANES_SYMBOLS: std::ops::RangeInclusive<u32> = 2..=6;
@@ -129,6 +135,9 @@ impl Shape {
             return Err(ShapeError::Pairs { l });
         }
         let column_bytes = n.div_ceil(2) as u64 * 4;
+        // Parts of equal size, but for the column where one ends.
+        let parts = (pair_count(l) as u64 * PAIR_BYTES).div_ceil(PART_BYTES);
+        let most_pairs = (pair_count(l) as u64).div_ceil(parts) + l as u64;
         let mut chunks: Vec<Chunk> = Vec::new();
         let mut first_place = 0;
         for i in 0..narrow(l) - 1 {
@@ -136,7 +145,8 @@ impl Shape {
             match chunks.last_mut() {
                 Some(chunk)
                     if u64::from(chunk.columns + 1) * column_bytes <= binding_bytes
-                        && u64::from(chunk.pairs + pairs) * 8 <= binding_bytes =>
+                        && u64::from(chunk.pairs + pairs) * 8 <= binding_bytes
+                        && u64::from(chunk.pairs + pairs) <= most_pairs =>
                 {
                     chunk.columns += 1;
                     chunk.pairs += pairs;
@@ -190,6 +200,33 @@ impl Shape {
     #[must_use]
     pub fn chunks(&self) -> &[Chunk] {
         &self.chunks
+    }
+
+    /// The chunks, in parts whose sums are few enough bytes for one job's result.
+    #[must_use]
+    pub fn parts(&self) -> Vec<Range<usize>> {
+        let mut parts: Vec<Range<usize>> = Vec::new();
+        let mut bytes = 0;
+        for (index, chunk) in self.chunks.iter().enumerate() {
+            let more = u64::from(chunk.pairs) * PAIR_BYTES;
+            match parts.last_mut() {
+                Some(part) if bytes + more <= PART_BYTES => {
+                    part.end = index + 1;
+                    bytes += more;
+                }
+                _ => {
+                    parts.push(index..index + 1);
+                    bytes = more;
+                }
+            }
+        }
+        parts
+    }
+
+    /// Pairs of some of the chunks.
+    #[must_use]
+    pub fn pairs_of(&self, chunks: Range<usize>) -> usize {
+        self.chunks.get(chunks).unwrap_or_default().iter().map(|chunk| chunk.pairs as usize).sum()
     }
 
     pub(super) fn sizes(&self) -> Sizes {
@@ -281,17 +318,9 @@ fn symbol_order(alignment: &Alignment, bounds: &[u32], chunk: Chunk) -> Vec<u8> 
     let stride = 2 * alignment.n().next_multiple_of(2);
     let columns = chunk.columns as usize;
     let mut orders = vec![0; stride * columns];
-    let cores = thread::available_parallelism().map_or(1, NonZero::get);
-    let share = columns.div_ceil(cores);
-    thread::scope(|scope| {
-        for (number, orders) in orders.chunks_mut((stride * share).max(1)).enumerate() {
-            scope.spawn(move || {
-                let first = chunk.first_i as usize + number * share;
-                for (column, order) in (first..).zip(orders.chunks_exact_mut(stride)) {
-                    order_column(alignment, bounds, column, order);
-                }
-            });
-        }
+    let first = chunk.first_i as usize;
+    orders.par_chunks_exact_mut(stride).zip(first..first + columns).for_each(|(order, column)| {
+        order_column(alignment, bounds, column, order);
     });
     orders
 }

@@ -12,7 +12,7 @@ use farm_core::{
 };
 use gpu_exec::{DeviceSpec, Executor, ExecutorConfig, ExecutorEvent, Order, expand};
 use mi_kernel::{
-    Accumulators, Reference, Seed,
+    Accumulators, PairSums, Reference, Seed,
     gpu::{AlignmentContents, MiJob, PackedAlignment, Pass, Shape, module_source},
 };
 
@@ -54,6 +54,13 @@ impl Device {
 
     /// The sums of a pass over iterations.
     pub(crate) fn sums(&self, reference: &Reference<'_>, shape: &Shape, job: &MiJob) -> Accumulators {
+        let mut sums = Accumulators::new(reference.alignment().l());
+        sums.merge_parts(vec![self.part(reference, shape, job)]).expect("the job is of all pairs");
+        sums
+    }
+
+    /// The sums of a pass over iterations for some of the pairs.
+    pub(crate) fn part(&self, reference: &Reference<'_>, shape: &Shape, job: &MiJob) -> PairSums {
         let sections = self.run(job, reference, shape);
         job.sums(shape, reference.observed(), &sections).expect("the sections are the job's")
     }

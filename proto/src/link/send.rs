@@ -22,7 +22,8 @@ const BURST_FRAMES: usize = 512;
 const WRITE_BYTES: usize = 64 << 10;
 /// How long `close_after_sent` waits for the peer's acknowledgement.
 const FLUSH_TIMEOUT: Duration = Duration::from_secs(2);
-/// The ordered stream goes before the bulk streams.
+/// The ordered stream goes before the bulk streams, and of those the older ones first: of large frames that are ready together the
+/// first is there when it could be, not when all are.
 const ORDERED_PRIORITY: i32 = 1;
 
 /// A frame was not taken.
@@ -224,6 +225,12 @@ fn append_small<S: Header>(
     Ok(())
 }
 
+/// Of the large frame on the stream with this number: the later it was opened, the lower.
+fn bulk_priority(stream: u64) -> i32 {
+    const WRAPS_AT: u64 = 1 << 30;
+    -i32::try_from(stream % WRAPS_AT).unwrap_or(0)
+}
+
 async fn write_bulk<S: Header>(
     shared: Arc<Shared>,
     permit: OwnedSemaphorePermit,
@@ -237,6 +244,8 @@ async fn write_bulk<S: Header>(
         return;
     }
     let Ok(mut stream) = shared.connection.open_uni().await else { return };
+    // As above: the first write says whether the stream is gone.
+    let _ = stream.set_priority(bulk_priority(stream.id().index()));
     let mut chunks = Vec::with_capacity(payload.len() + 1);
     chunks.push(buffer.freeze());
     chunks.extend(payload);

@@ -84,7 +84,7 @@ pub(super) fn result(bytes: &[u8]) -> Verdict {
     let (kind, rest) = bytes.split_first().ok_or("no kind")?;
     let sections = sections(rest);
     let pass = match kind % 3 {
-        0 => Pass::Reduce(4..9),
+        0 => Pass::Reduce { iterations: 4..9, chunks: 0..SHAPE.chunks().len() },
         1 => Pass::Matrix(4..9),
         _ => Pass::Observed,
     };
@@ -92,5 +92,8 @@ pub(super) fn result(bytes: &[u8]) -> Verdict {
     if job.pass == Pass::Observed {
         return job.scores(&SHAPE, &sections).map(drop).map_err(refused);
     }
-    in_use(job.sums(&SHAPE, &OBSERVED, &sections).map_err(refused)?)
+    let part = job.sums(&SHAPE, &OBSERVED, &sections).map_err(refused)?;
+    let mut sums = Accumulators::new(alignment().l());
+    sums.merge_parts(vec![part]).map_err(refused)?;
+    in_use(sums)
 }
