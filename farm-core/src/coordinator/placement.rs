@@ -94,6 +94,7 @@ impl CoordinatorMachine {
             self.fresh.push_front(pending);
         }
         self.projects.relieve_all();
+        self.any_runs_dry();
     }
 
     pub(super) fn forget_pending(&mut self, gone: impl Fn(&Pending) -> bool) {

@@ -241,6 +241,7 @@ impl CoordinatorMachine {
             && let Some(device) = node.device_mut(place.device)
         {
             device.drop_load(place.load);
+            self.runs_dry((place.node, place.device));
         }
     }
 

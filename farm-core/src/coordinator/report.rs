@@ -168,6 +168,7 @@ impl CoordinatorMachine {
         let planned_jobs = device.planned_jobs;
         self.left_place(job.job.app, batch);
         self.device_has(planned_jobs, job.job.app, batch);
+        self.runs_dry((id, place.device));
         Some(place.load)
     }
 

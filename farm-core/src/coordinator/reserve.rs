@@ -7,13 +7,13 @@
 
 use super::{
     CoordinatorMachine,
-    model::{JobState, Pending},
+    model::{JobState, Node, Pending},
     neighbours::{Estimates, Place},
     placement::{load_amount, told_load},
     policy::{History, LongestFirst, Packed, PlacementPolicy as _, Policy, Question},
 };
 use crate::{
-    id::{AppId, BatchId, JobIndex, JobKey},
+    id::{AppId, BatchId, DeviceIndex, JobIndex, JobKey},
     message::CostNs,
     time::Instant,
 };
@@ -143,6 +143,39 @@ impl CoordinatorMachine {
         let low = self.apps.get(&app).and_then(|app| app.batches.get(&batch)).map(|batch| batch.low);
         if low.is_some_and(|low| planned_jobs <= low.on_device) {
             self.next_part(app, batch);
+        }
+    }
+
+    /// A device may have nothing left: then the next part is due of every batch that it takes jobs of, whosever its last one was.
+    pub(super) fn runs_dry(&mut self, (id, index): Place) {
+        if self.reserved.is_empty() {
+            return;
+        }
+        let Some(node) = self.nodes.get(&id).filter(|node| node.takes_work()) else { return };
+        let Some(device) = node.devices.get(usize::from(index.0)) else { return };
+        if device.planned_jobs > 0 || device.lost {
+            return;
+        }
+        let fits = |(app, batch): &(AppId, BatchId)| {
+            let batch = self.apps.get(app).and_then(|app| app.batches.get(batch));
+            batch.is_some_and(|batch| batch.needs.fulfilled_by(&device.info))
+        };
+        let due: Vec<(AppId, BatchId)> = self.reserved.keys().copied().filter(fits).collect();
+        for (app, batch) in due {
+            self.next_part(app, batch);
+        }
+    }
+
+    /// The same of all devices: some may be new, or take work again.
+    pub(super) fn any_runs_dry(&mut self) {
+        if self.reserved.is_empty() {
+            return;
+        }
+        let indices = |node: &Node| (0..).map(DeviceIndex).take(node.devices.len());
+        let places: Vec<Place> =
+            self.nodes.iter().flat_map(|(&id, node)| indices(node).map(move |index| (id, index))).collect();
+        for place in places {
+            self.runs_dry(place);
         }
     }
 

@@ -173,6 +173,11 @@ impl Lags {
         })
     }
 
+    /// The largest cost of a job, slowly forgotten; zero before the first.
+    pub(super) const fn largest_charge(&self) -> f64 {
+        self.largest_charge
+    }
+
     /// Mean cost of a job.
     pub(super) fn mean_charge(&self) -> f64 {
         self.mean_charge.unwrap_or(UNKNOWN_CHARGE)

@@ -12,11 +12,6 @@ impl Lags {
     fn awake(&self) -> impl Iterator<Item = (AppId, f64)> {
         self.entrants.iter().filter(|(_, entrant)| entrant.awake).map(|(&app, entrant)| (app, entrant.lag))
     }
-
-    /// The largest charge that has not been forgotten.
-    const fn largest_charge(&self) -> f64 {
-        self.largest_charge
-    }
 }
 
 const WEIGHTS: [f64; 3] = [3.0, 2.0, 1.0];
@@ -114,6 +109,20 @@ fn lag_stays_below_five_largest_charges() {
             }
         }
     }
+}
+
+#[test]
+fn chance_ends_before_the_bar() {
+    let draws_of_the_first = |charges: usize| {
+        let mut lags = awake(&[1.0, 1.0]);
+        (0..charges).for_each(|_| lags.charge(AppId(0), 1.0));
+        let mut rule = Share::DEFAULT.rule();
+        let mut rng = SmallRng::seed_from_u64(1);
+        let draws = (0..1_000).map(|_| rule.draw(&lags, &mut (0..2).map(AppId), &mut rng).unwrap());
+        draws.filter(|app| *app == AppId(0)).count()
+    };
+    assert!(draws_of_the_first(6) > 0, "at three largest jobs too much it still moves");
+    assert_eq!(draws_of_the_first(10), 0, "at five the other one is next");
 }
 
 #[test]
