@@ -292,13 +292,13 @@ pub(crate) struct StatusArgs {
     #[arg(short = 'o', long, value_enum, id = "status_format")]
     pub output: Option<Format>,
     /// Print again every INTERVAL until interrupted.
-    #[arg(long, value_name = "INTERVAL", num_args = 0..=1, default_missing_value = "1s", value_parser = duration)]
+    #[arg(long, value_name = "INTERVAL", num_args = 0..=1, default_missing_value = "1s", value_parser = pause)]
     pub watch: Option<Duration>,
 }
 
 #[derive(Debug, Args)]
 pub(crate) struct TimelineArgs {
-    /// An application or one of its tasks: app-3, 3, app-3/task-0, 3/0, @last or @all.
+    /// An application or one of its tasks: app-3, 3, app-3/task-1, 3/1, @last or @all.
     #[arg(default_value = "@last")]
     pub task: String,
     /// How it is shown; json or table as before the verb without it.
@@ -638,6 +638,13 @@ fn share(text: &str) -> Result<f64, String> {
     if (0.0..=1.0).contains(&share) { Ok(share) } else { Err("not from 0 to 1".to_owned()) }
 }
 
+/// A pause between two looks at the farm: short ones would be nothing but load.
+fn pause(text: &str) -> Result<Duration, String> {
+    const LEAST: Duration = Duration::from_millis(100);
+    let pause = duration(text)?;
+    if pause < LEAST { Err(format!("{text:?}: at least {LEAST:?}")) } else { Ok(pause) }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -656,6 +663,12 @@ mod tests {
         for bad in ["", "x", "-0.1", "1.5", "nan", "inf"] {
             assert!(share(bad).is_err(), "{bad}");
         }
+    }
+
+    #[test]
+    fn a_farm_is_not_asked_without_a_pause() {
+        assert_eq!(pause("100ms"), Ok(Duration::from_millis(100)));
+        assert!(pause("0").unwrap_err().contains("at least 100ms"));
     }
 
     #[test]

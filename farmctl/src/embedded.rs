@@ -30,6 +30,11 @@ impl EmbeddedFarm {
         devices: &[String],
     ) -> Result<(Reach, Option<Self>), Failure> {
         if let Some(reach) = target.named().await? {
+            if !devices.is_empty() {
+                let reason =
+                    format!("--device is for a farm of your own, and {} was named", target.address());
+                return Err(Failure::Usage(anyhow::anyhow!(reason)));
+            }
             return Ok((reach, None));
         }
         let farm = Self::start(devices).await?;

@@ -31,7 +31,7 @@ const MAX_ADVERTISED: usize = 16;
 ///
 /// When it is registered, it prints one JSON line on stdout with its node, data address and devices; logs go to stderr
 /// (RUST_LOG). SIGTERM or SIGINT drains it, a second one ends it at once. Exit codes: 0 ended as asked, 1 failed, 2 wrong
-/// usage or settings, 3 coordinator unreachable at the start.
+/// usage or settings, 3 coordinator unreachable at the start, 4 not let in.
 #[derive(Debug, Parser)]
 #[command(name = "farm-worker", version)]
 pub(crate) struct Arguments {

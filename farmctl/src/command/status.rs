@@ -58,11 +58,13 @@ fn headline(status: &FarmStatus) -> String {
     };
     let waiting: u64 = status.apps.iter().map(|app| app.waiting_jobs).sum();
     let outstanding: u64 = status.apps.iter().map(|app| app.outstanding_jobs).sum();
-    let word = match (waiting, outstanding, status.nodes.is_empty()) {
+    // Jobs that wait while others of their application have a place are nothing to look after: they are placed in parts.
+    let stuck = status.apps.iter().any(|app| app.waiting_jobs > 0 && app.outstanding_jobs == 0);
+    let word = match (stuck, outstanding, status.nodes.is_empty()) {
         (_, _, true) => "EMPTY",
-        (1.., _, _) => "WAITING",
-        (0, 1.., _) => "WORKING",
-        (0, 0, _) => "IDLE",
+        (true, _, _) => "WAITING",
+        (false, 1.., _) => "WORKING",
+        (false, 0, _) => "IDLE",
     };
     format!(
         "{word}  nodes: {nodes}  devices: {busy} of {} busy{}  jobs: {outstanding} placed, {waiting} waiting, {} delivered, \
@@ -213,6 +215,15 @@ mod tests {
         }
         assert!(!text.contains("7800"), "addresses are for `-o wide`");
         assert!(screen(&farm(), true).contains("7800"), "`-o wide` shows addresses");
+    }
+
+    #[test]
+    fn waiting_is_whose_jobs_have_no_place_at_all() {
+        let mut status = farm();
+        status.apps[0].waiting_jobs = 40;
+        assert!(screen(&status, false).starts_with("WORKING"), "the next part of many");
+        status.apps[0].outstanding_jobs = 0;
+        assert!(screen(&status, false).starts_with("WAITING"));
     }
 
     #[test]

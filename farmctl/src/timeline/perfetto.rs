@@ -1,6 +1,8 @@
 //! The timeline in Chrome's trace event format, which <https://ui.perfetto.dev> opens: a process for each node, a
 //! thread for each device, a slice for each attempt, an arrow for each steal.
 
+use std::collections::BTreeMap;
+
 use farm_core::{
     coordinator::timeline::{Migration, Segment},
     id::{DeviceIndex, NodeId},
@@ -13,21 +15,22 @@ use super::Chart;
 /// The whole document.
 pub(crate) fn trace(chart: &Chart<'_>) -> Value {
     let mut events = Vec::new();
+    let processes = processes(chart);
     let mut named = None;
     for &(node, device) in chart.rows.keys() {
         if named.replace(node) != Some(node) {
             events.push(json!({
-                "ph": "M", "name": "process_name", "pid": node.0, "tid": 0,
+                "ph": "M", "name": "process_name", "pid": processes[&node], "tid": 0,
                 "args": {"name": format!("{} ({node})", chart.node_name(node))},
             }));
         }
         events.push(json!({
-            "ph": "M", "name": "thread_name", "pid": node.0, "tid": thread(device),
+            "ph": "M", "name": "thread_name", "pid": processes[&node], "tid": thread(device),
             "args": {"name": device_name(chart, node, device)},
         }));
     }
     for (id, segment) in chart.timeline.segments.iter().enumerate() {
-        events.push(slice(chart, segment));
+        events.push(slice(chart, segment, processes[&segment.node]));
         let Some(migration) = segment.migration else { continue };
         let (kind, node, device) = match migration {
             Migration::Local { device } => ("local steal", segment.node, device),
@@ -39,20 +42,33 @@ pub(crate) fn trace(chart: &Chart<'_>) -> Value {
             Migration::Global { .. } => segment.scheduled_at,
         };
         events.push(json!({
-            "ph": "s", "id": id, "name": kind, "cat": "steal", "pid": node.0, "tid": thread(device),
-            "ts": microseconds(chart, at),
+            "ph": "s", "id": id, "name": kind, "cat": "steal", "pid": processes[&node],
+            "tid": thread(device), "ts": microseconds(chart, at),
         }));
         events.push(json!({
-            "ph": "f", "bp": "e", "id": id, "name": kind, "cat": "steal", "pid": segment.node.0,
+            "ph": "f", "bp": "e", "id": id, "name": kind, "cat": "steal", "pid": processes[&segment.node],
             "tid": thread(segment.device), "ts": microseconds(chart, segment.started_at),
         }));
     }
     json!({"displayTimeUnit": "ms", "traceEvents": events})
 }
 
-fn slice(chart: &Chart<'_>, segment: &Segment) -> Value {
+/// Numbers of the nodes, from 1: ids have 64 bits, and viewers take 32.
+fn processes(chart: &Chart<'_>) -> BTreeMap<NodeId, u32> {
+    let mut processes: BTreeMap<NodeId, u32> = chart.rows.keys().map(|&(node, _)| (node, 0)).collect();
+    for segment in &chart.timeline.segments {
+        processes.insert(segment.node, 0);
+        if let Some(Migration::Global { node, .. }) = segment.migration {
+            processes.insert(node, 0);
+        }
+    }
+    processes.values_mut().zip(1..).for_each(|(process, number)| *process = number);
+    processes
+}
+
+fn slice(chart: &Chart<'_>, segment: &Segment, process: u32) -> Value {
     json!({
-        "ph": "X", "name": segment.job.job.to_string(), "cat": "job", "pid": segment.node.0,
+        "ph": "X", "name": segment.job.job.to_string(), "cat": "job", "pid": process,
         "tid": thread(segment.device), "ts": microseconds(chart, segment.started_at),
         "dur": segment.ended_at.since(segment.started_at).as_secs_f64() * 1e6,
         "args": {
@@ -98,5 +114,17 @@ mod tests {
         assert_eq!((&of("s")[0]["pid"], &of("s")[0]["tid"]), (&json!(1), &json!(2)), "from the victim");
         assert_eq!(of("f")[0]["ts"], of("X")[1]["ts"], "to the start of the stolen one");
         assert_eq!(of("X")[1]["args"]["job"], "1/0/1");
+    }
+
+    #[test]
+    fn nodes_of_any_id_have_numbers_that_viewers_take() {
+        let far = 123_572_252_124_905_473;
+        let global = Some(Migration::Global { node: NodeId(far + 1), device: DeviceIndex(0) });
+        let timeline = timeline("w", vec![segment(far, 0, 0, global)]);
+        let document = trace(&Chart::new(&timeline));
+        let events = document["traceEvents"].as_array().unwrap();
+        let of = |phase: &str| &events.iter().find(|event| event["ph"] == phase).unwrap()["pid"];
+        // After those of the farm's own two nodes.
+        assert_eq!((of("X"), of("s"), of("f")), (&json!(3), &json!(4), &json!(3)));
     }
 }
