@@ -34,8 +34,8 @@ pub const NULL_TASK: &str = "null";
 /// Most iterations of one run.
 pub const MAX_ITERATIONS: u64 = 10_000_000;
 
-/// Most bytes of results of jobs in flight, apart from the one that always is. They wait in the nodes' spools: what the
-/// application holds of them is bounded by its `Window`.
+/// Most bytes of results of jobs in flight and of sums that wait for those of the other pairs, apart from the jobs that always are.
+/// Results wait in the nodes' spools: what the application holds of them is bounded by its `Window`.
 const FLIGHT_BYTES: u64 = 8 << 30;
 /// The same until the first results say how long an iteration takes.
 const FIRST_FLIGHT_BYTES: u64 = 2 << 30;
@@ -51,6 +51,8 @@ const JOB_ITERATIONS: u64 = 256;
 const JOB_COMMANDS: u64 = 3_500;
 /// Most bytes of a job's matrices.
 const JOB_MATRIX_BYTES: u64 = 256 << 20;
+/// Bytes of a pair's sums in a result.
+const PAIR_SUMS_BYTES: u64 = 20;
 /// Bytes of sums that a device makes in a second at most, where a job may be that long: some five devices together fill
 /// what an application takes (about 500 MB/s).
 const SUMS_BYTES_PER_S: f64 = 80e6;
@@ -216,6 +218,8 @@ struct Lengths {
     pairs: u64,
     /// Jobs over the same iterations, each of a part of the pairs.
     parts: u64,
+    /// Of the largest part.
+    part_pairs: u64,
     /// While nothing is known of the devices: long enough for a fast one, short enough that many share the run.
     first: u64,
     most: u64,
@@ -226,8 +230,9 @@ impl Lengths {
         let pairs = shape.pairs() as u64;
         let parts = parts_of(shape, mode);
         let chunks = parts.iter().map(Range::len).max().unwrap_or(1) as u64;
+        let part_pairs = parts.iter().map(|part| shape.pairs_of(part.clone())).max().unwrap_or(1) as u64;
         let parts = parts.len() as u64;
-        let long = JOB_COUNTS * parts / (pairs * u64::from(shape.rows())).max(1);
+        let long = JOB_COUNTS / (part_pairs * u64::from(shape.rows())).max(1);
         let commands = JOB_COMMANDS / (4 + 3 * chunks);
         let held = match mode {
             Mode::Reduce => JOB_ITERATIONS,
@@ -235,7 +240,7 @@ impl Lengths {
         };
         let most = JOB_ITERATIONS.min(commands).min(held).max(1);
         let first = long.min((iterations * parts).div_ceil(LEAST_JOBS)).clamp(1, most);
-        Self { mode, by, pairs, parts, first, most }
+        Self { mode, by, pairs, parts, part_pairs, first, most }
     }
 
     /// Iterations of the next job, `left` being without one. `iteration_s` is what one took so far: where sums are large
@@ -249,7 +254,7 @@ impl Lengths {
     fn next(&self, left: u64, iteration_s: Option<f64>) -> u64 {
         let by_result = match (self.mode, self.by, iteration_s) {
             (Mode::Reduce, JobLengths::Measured, Some(iteration_s)) => {
-                (self.result_bytes(1) as f64 * self.parts as f64 / (SUMS_BYTES_PER_S * iteration_s)) as u64
+                (self.pairs as f64 * PAIR_SUMS_BYTES as f64 / (SUMS_BYTES_PER_S * iteration_s)) as u64
             }
             _ => 0,
         };
@@ -261,7 +266,7 @@ impl Lengths {
     /// Bytes of one job's result.
     fn result_bytes(&self, iterations: u64) -> u64 {
         match self.mode {
-            Mode::Reduce => self.pairs * 20 / self.parts,
+            Mode::Reduce => self.part_pairs * PAIR_SUMS_BYTES,
             Mode::Matrix => self.pairs * 4 * iterations,
         }
     }
@@ -321,8 +326,8 @@ struct Shared {
     observed: OnceLock<Vec<i32>>,
     observed_contents: OnceLock<Vec<Content>>,
     /// Sums of some of the pairs, by the first iteration that they are of, until those of the others are there: what a run is
-    /// stopped with has to be of the same iterations for all pairs. Jobs of the same iterations are dispatched together, so of
-    /// those in flight few wait. Held for one insertion.
+    /// stopped with has to be of the same iterations for all pairs. Jobs of the same iterations are dispatched together, and new
+    /// ones only while those that wait and those in flight come to a bounded number of bytes. Held for one insertion.
     parts: Mutex<BTreeMap<u64, Vec<PairSums>>>,
     /// A lock, not an owner with messages: jobs are retrieved on the run's own threads and must know that their sums
     /// were taken before they say so; the handle reads between two of them. Held for one merge or one copy.
@@ -356,6 +361,12 @@ impl Shared {
             self.iterations_done.fetch_add(iterations, Ordering::Relaxed);
         }
         Ok(())
+    }
+
+    /// Results whose sums wait for those of the other pairs.
+    fn waiting_parts(&self) -> u64 {
+        let parts = self.parts.lock().unwrap_or_else(PoisonError::into_inner);
+        parts.values().map(|there| there.len() as u64).sum()
     }
 
     fn contents(&self) -> Result<&AlignmentContents, DispatchError> {
@@ -442,7 +453,7 @@ impl NullTask {
     fn next_jobs(&mut self, progress: &TaskProgress) -> Vec<Box<dyn Job>> {
         let iteration_s = self.iteration_s(progress);
         let parts = parts_of(&self.shared.shape, self.mode);
-        let mut in_flight = progress.jobs_known - progress.jobs_done;
+        let mut in_flight = progress.jobs_known - progress.jobs_done + self.shared.waiting_parts();
         let mut jobs: Vec<Box<dyn Job>> = Vec::new();
         let mut left = self.remaining.left();
         while left > 0 {
@@ -599,6 +610,31 @@ mod tests {
     }
 
     #[test]
+    fn sums_that_wait_for_other_pairs_count_as_in_flight() {
+        let columns = "AC".repeat(1_350);
+        let alignment = Arc::new(parse(format!("{columns}\n{columns}\n").as_bytes()).unwrap().alignment);
+        let (_, handle) = mi_graph(alignment, options(100_000, None)).unwrap();
+        let shared = Arc::clone(&handle.shared);
+        assert_eq!(shared.shape.parts().len(), 2);
+        let mut task = NullTask {
+            needs: Requirements::ANY,
+            remaining: Remaining::new(&handle.sums(), 100_000),
+            lengths: Lengths::new(&shared.shape, Mode::Reduce, JobLengths::Fixed, 100_000),
+            seed: Seed(1),
+            mode: Mode::Reduce,
+            shared: Arc::clone(&shared),
+        };
+        let jobs = task.next_jobs(&TaskProgress::default()).len() as u64;
+        let progress = TaskProgress { jobs_known: jobs, jobs_done: jobs / 2, ..TaskProgress::default() };
+        let part = PairSums::new(2_700, 0, Vec::new(), Vec::new(), Vec::new(), BTreeMap::new()).unwrap();
+        let wait = |parts| shared.parts.lock().unwrap().insert(0, vec![part.clone(); parts]);
+        wait(usize::try_from(jobs / 2).unwrap());
+        assert!(task.next_jobs(&progress).is_empty(), "half of them are in flight, and half wait here");
+        wait(0);
+        assert!(!task.next_jobs(&progress).is_empty());
+    }
+
+    #[test]
     fn first_jobs_fit_the_run_and_the_program() {
         let alignment = parse(b"ACA\nACC\nGTA\nGTC\n").unwrap().alignment;
         let shape = Shape::new(&alignment).unwrap();
@@ -616,7 +652,15 @@ mod tests {
     fn jobs_are_as_long_as_their_results_are_large_and_short_at_the_end() {
         // The thesis' second set on an H200: 252 MB of sums, 44 ms an iteration.
         let by = JobLengths::Measured;
-        let lengths = Lengths { mode: Mode::Reduce, by, pairs: 12_628_338, parts: 1, first: 3, most: 256 };
+        let lengths = Lengths {
+            mode: Mode::Reduce,
+            by,
+            pairs: 12_628_338,
+            parts: 1,
+            part_pairs: 12_628_338,
+            first: 3,
+            most: 256,
+        };
         assert_eq!(lengths.next(10_000, None), 3);
         assert_eq!(lengths.next(10_000, Some(0.044)), 71);
         assert_eq!(lengths.next(400, Some(0.044)), 50);
@@ -629,7 +673,7 @@ mod tests {
         assert_eq!(matrices.next(10_000, Some(0.044)), 3, "twice the iterations are twice the bytes");
         assert_eq!((lengths.in_flight(71, false), lengths.in_flight(71, true)), (8, 34));
         // In four parts: the same bytes, but a job has a quarter of them, and of the time.
-        let parts = Lengths { parts: 4, ..lengths };
+        let parts = Lengths { parts: 4, part_pairs: 12_628_338 / 4, ..lengths };
         assert_eq!((parts.next(10_000, Some(0.044)), parts.next(400, Some(0.044))), (71, 71));
         assert_eq!((parts.in_flight(71, false), parts.in_flight(71, true)), (34, 136));
     }

@@ -188,11 +188,13 @@ impl CoordinatorMachine {
 /// How many of the waiting jobs go out now.
 fn part(waiting: usize, devices: f64, measured: bool) -> usize {
     let last = whole(LAST * devices);
-    if waiting <= last {
+    // Nobody waits for the first part: it has a job for every device.
+    let least = if measured { 0 } else { whole(devices) };
+    if waiting <= last + least {
         return waiting;
     }
     let part = if measured { (PART * waiting as f64).max(devices) } else { FIRST * devices };
-    whole(part).clamp(1, waiting - last)
+    whole(part).clamp(1.max(least), waiting - last)
 }
 
 /// How many jobs a device should have in the place of one, because they are short.
@@ -229,4 +231,23 @@ const fn evenly(index: JobIndex) -> u32 {
 )]
 const fn whole(jobs: f64) -> usize {
     jobs as usize
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_first_part_has_a_job_for_every_device() {
+        for devices in [1.0, 2.0, 8.0, 32.0] {
+            for waiting in 1..300 {
+                let first = part(waiting, devices, false);
+                assert!(
+                    first >= waiting.min(whole(devices)),
+                    "{first} of {waiting} jobs for {devices} devices"
+                );
+            }
+        }
+        assert_eq!(part(540, 32.0, false), 96, "three for each");
+    }
 }

@@ -21,8 +21,8 @@ const RESULT_BYTES: u64 = 1 << 30;
 /// Bytes of a pair's accumulators: sum, sum of squares, count.
 const PAIR_BYTES: u64 = 20;
 
-/// Most bytes of the sums of one part of the pairs. Where all pairs have more, a job is of one part: for the same bytes over
-/// the network it has as many times more iterations, and at the end of a run devices wait for less. Each part shuffles anew,
+/// Bytes of the sums of one part of the pairs, but for a column's. Where all pairs have more, a job is of one part: for the same bytes
+/// over the network it has as many times more iterations, and at the end of a run devices wait for less. Each part shuffles anew,
 /// some hundredths of a part's work.
 const PART_BYTES: u64 = 64 << 20;
 
@@ -135,7 +135,7 @@ impl Shape {
             return Err(ShapeError::Pairs { l });
         }
         let column_bytes = n.div_ceil(2) as u64 * 4;
-        // Parts of equal size, but for the column where one ends.
+        // Parts of equal size, but for the column where one ends; smaller where a binding holds fewer columns.
         let parts = (pair_count(l) as u64 * PAIR_BYTES).div_ceil(PART_BYTES);
         let most_pairs = (pair_count(l) as u64).div_ceil(parts) + l as u64;
         let mut chunks: Vec<Chunk> = Vec::new();

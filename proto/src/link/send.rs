@@ -22,9 +22,12 @@ const BURST_FRAMES: usize = 512;
 const WRITE_BYTES: usize = 64 << 10;
 /// How long `close_after_sent` waits for the peer's acknowledgement.
 const FLUSH_TIMEOUT: Duration = Duration::from_secs(2);
-/// The ordered stream goes before the bulk streams, and of those the older ones first: of large frames that are ready together the
-/// first is there when it could be, not when all are.
-const ORDERED_PRIORITY: i32 = 1;
+/// The ordered stream goes before the bulk streams, and those go before contents, which have QUIC's default of 0: a job that waits
+/// for nothing else does not wait for another one's data.
+const ORDERED_PRIORITY: i32 = i32::MAX;
+/// Frames of up to so many bytes go side by side. Of larger ones the older goes first: of several that are ready together the first is
+/// there when it could be, not when all are.
+const SIDE_BY_SIDE_BYTES: usize = 8 << 20;
 
 /// A frame was not taken.
 #[derive(Debug, Error)]
@@ -225,10 +228,14 @@ fn append_small<S: Header>(
     Ok(())
 }
 
-/// Of the large frame on the stream with this number: the later it was opened, the lower.
-fn bulk_priority(stream: u64) -> i32 {
-    const WRAPS_AT: u64 = 1 << 30;
-    -i32::try_from(stream % WRAPS_AT).unwrap_or(0)
+/// Of a frame of so many bytes on the stream with this number.
+fn bulk_priority(bytes: usize, stream: u64) -> i32 {
+    const OLDEST: i32 = 1 << 30;
+    if bytes <= SIDE_BY_SIDE_BYTES {
+        return OLDEST + 1;
+    }
+    // Numbers wrap after 2^30 frames: then one younger frame goes first.
+    i32::try_from(stream % u64::from(OLDEST.unsigned_abs())).map_or(1, |age| OLDEST - age)
 }
 
 async fn write_bulk<S: Header>(
@@ -245,7 +252,8 @@ async fn write_bulk<S: Header>(
     }
     let Ok(mut stream) = shared.connection.open_uni().await else { return };
     // As above: the first write says whether the stream is gone.
-    let _ = stream.set_priority(bulk_priority(stream.id().index()));
+    let bytes = payload.iter().map(Bytes::len).sum();
+    let _ = stream.set_priority(bulk_priority(bytes, stream.id().index()));
     let mut chunks = Vec::with_capacity(payload.len() + 1);
     chunks.push(buffer.freeze());
     chunks.extend(payload);
@@ -254,4 +262,20 @@ async fn write_bulk<S: Header>(
         let _ = stream.stopped().await;
     }
     drop(permit);
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn small_frames_pass_large_ones_and_all_pass_contents() {
+        const CONTENTS: i32 = 0;
+        let (small, large) = (SIDE_BY_SIDE_BYTES, SIDE_BY_SIDE_BYTES + 1);
+        assert!(ORDERED_PRIORITY > bulk_priority(small, 1));
+        assert_eq!(bulk_priority(small, 1), bulk_priority(0, 1 << 40), "side by side");
+        assert!(bulk_priority(small, 9) > bulk_priority(large, 0));
+        assert!(bulk_priority(large, 7) > bulk_priority(large, 8), "the older one first");
+        assert!(bulk_priority(large, (1 << 30) - 1) > CONTENTS);
+    }
 }
