@@ -21,7 +21,7 @@ fn path_or_nothing() -> impl TypedValueParser<Value = PathBuf> {
 #[command(name = "farmctl", version, disable_version_flag = false)]
 pub(crate) struct Cli {
     /// The farm's coordinator; without one, `render` and `mi` start a farm of their own, as `bench` always does.
-    #[arg(long, env = "GLEANER_COORDINATOR", value_name = "HOST:PORT")]
+    #[arg(long, env = "GLEANER_COORDINATOR", value_name = "HOST:PORT", global = true)]
     pub coordinator: Option<String>,
     /// Who you are in a secured farm: what `init` or `join` has written; there, where it is written to
     /// [default: ~/.config/gleaner/user.pem, of nodes node.pem].

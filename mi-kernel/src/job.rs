@@ -22,7 +22,7 @@ use thiserror::Error;
 
 use crate::{
     Accumulators, Alignment, NullModelError, PairSums, Reference, ReferenceError, Seed,
-    gpu::{AlignmentContents, MiJob, PackedAlignment, Pass, Shape, ShapeError, module_source},
+    gpu::{AlignmentContents, MiJob, PAIR_BYTES, PackedAlignment, Pass, Shape, ShapeError, module_source},
     pair_count,
 };
 
@@ -51,8 +51,6 @@ const JOB_ITERATIONS: u64 = 256;
 const JOB_COMMANDS: u64 = 3_500;
 /// Most bytes of a job's matrices.
 const JOB_MATRIX_BYTES: u64 = 256 << 20;
-/// Bytes of a pair's sums in a result.
-const PAIR_SUMS_BYTES: u64 = 20;
 /// Bytes of sums that a device makes in a second at most, where a job may be that long: some five devices together fill
 /// what an application takes (about 500 MB/s).
 const SUMS_BYTES_PER_S: f64 = 80e6;
@@ -107,7 +105,7 @@ pub enum MiError {
         iterations: u64,
     },
     /// The earlier sums hold iterations that were not asked for.
-    #[error("the earlier sums hold iteration {held}, past the {iterations} asked for")]
+    #[error("the earlier sums hold iteration {held} (counted from 0), past the {iterations} asked for")]
     Earlier {
         /// The last iteration held, from 0.
         held: u64,
@@ -254,7 +252,7 @@ impl Lengths {
     fn next(&self, left: u64, iteration_s: Option<f64>) -> u64 {
         let by_result = match (self.mode, self.by, iteration_s) {
             (Mode::Reduce, JobLengths::Measured, Some(iteration_s)) => {
-                (self.pairs as f64 * PAIR_SUMS_BYTES as f64 / (SUMS_BYTES_PER_S * iteration_s)) as u64
+                (self.pairs as f64 * PAIR_BYTES as f64 / (SUMS_BYTES_PER_S * iteration_s)) as u64
             }
             _ => 0,
         };
@@ -266,7 +264,7 @@ impl Lengths {
     /// Bytes of one job's result.
     fn result_bytes(&self, iterations: u64) -> u64 {
         match self.mode {
-            Mode::Reduce => self.part_pairs * PAIR_SUMS_BYTES,
+            Mode::Reduce => self.part_pairs * PAIR_BYTES,
             Mode::Matrix => self.pairs * 4 * iterations,
         }
     }

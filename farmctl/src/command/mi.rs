@@ -70,8 +70,10 @@ pub(crate) async fn run(arguments: &MiArgs, target: &Target<'_>) -> Result<(), F
     };
     let before = input.earlier.as_ref().map_or(0, Accumulators::iterations) as u64;
     let asked = arguments.iterations.saturating_sub(before);
-    let (graph, handle) =
-        mi_graph(Arc::clone(&input.alignment), options).with_context(|| shown(&arguments.alignment))?;
+    let (graph, handle) = mi_graph(Arc::clone(&input.alignment), options).with_context(|| {
+        let sums = arguments.folder.join(SUMS);
+        shown(if input.earlier.is_some() { &sums } else { &arguments.alignment })
+    })?;
     let path = journal_path(arguments);
     let journal = if arguments.resume {
         let MiArgs { iterations, seed, mode, gaps, .. } = arguments;
@@ -147,7 +149,10 @@ fn read(arguments: &MiArgs) -> Result<Input, Failure> {
     let parsed = parse(text.as_deref().unwrap_or(&bytes)).with_context(|| shown(&arguments.alignment))?;
     tell!("farmctl: {}: {}, {}", shown(&arguments.alignment), parsed.notes.format, parsed.alignment);
     if parsed.notes.duplicate_names > 0 {
-        tell!("farmctl: warning: {} names occur more than once", parsed.notes.duplicate_names);
+        tell!(
+            "farmctl: warning: sequences that have the name of an earlier one: {}",
+            parsed.notes.duplicate_names
+        );
     }
     let filters = Filters {
         min_coverage: arguments.min_coverage,

@@ -13,7 +13,9 @@ use crate::GapMode;
 
 pub use self::{
     job::{DecodeError, MiJob, Pass},
-    pack::{AlignmentContents, Chunk, MAX_KERNEL_ROWS, Method, PackedAlignment, Shape, ShapeError},
+    pack::{
+        AlignmentContents, Chunk, MAX_KERNEL_ROWS, Method, PAIR_BYTES, PackedAlignment, Shape, ShapeError,
+    },
 };
 
 /// The WGSL text for a shape's alphabet and gaps: one self-contained module, one file per stage.

@@ -18,8 +18,8 @@ const BINDING_BYTES: u64 = 128 << 20;
 /// Most bytes of one job's result: sums, squares, counts. Under the farm's quota of 1 GiB.
 const RESULT_BYTES: u64 = 1 << 30;
 
-/// Bytes of a pair's accumulators: sum, sum of squares, count.
-const PAIR_BYTES: u64 = 20;
+/// Bytes of a pair's accumulators in a result: sum, sum of squares, count.
+pub const PAIR_BYTES: u64 = 20;
 
 /// Bytes of the sums of one part of the pairs, but for a column's. Where all pairs have more, a job is of one part: for the same bytes
 /// over the network it has as many times more iterations, and at the end of a run devices wait for less. Each part shuffles anew,
