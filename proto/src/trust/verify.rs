@@ -163,3 +163,43 @@ impl ClientCertVerifier for MemberCheck {
 fn old_tls() -> Error {
     Error::General("TLS 1.2 is not spoken here".to_owned())
 }
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used, reason = "a step that fails fails its test")]
+mod tests {
+    use std::time::Duration;
+
+    use super::*;
+    use crate::trust::{Authority, Capability, IDENTITY_LIFETIME};
+
+    /// Scenario 32: the wall clocks of two machines are up to an hour apart, either way.
+    #[test]
+    fn s32_clocks_an_hour_apart_let_members_in_and_members_end_with_their_certificates() {
+        let minutes = |minutes: u64| Duration::from_secs(60 * minutes);
+        let authority = Authority::create("farm").unwrap();
+        let identity = |role, name| authority.identity(role, name, IDENTITY_LIFETIME).unwrap();
+        let (coordinator, node) = (identity(Role::Coordinator, "coordinator"), identity(Role::Node, "n"));
+        let app = identity(Role::App, "a");
+        let certified = app.certified();
+        let signed = |now| signed_by(&certified.cert[0], node.authority(), now);
+        let given = Capability {
+            app: farm_core::id::AppId(1),
+            incarnation: farm_core::id::AppIncarnation(1),
+            holder: app.principal().clone(),
+            epoch: farm_core::id::Epoch(1),
+            expires: SystemTime::now() + Duration::from_secs(86_400),
+        };
+        let capability = given.sign(&coordinator).unwrap();
+        let holds = |now| Capability::check(&capability, &node, app.principal(), now);
+        let now = SystemTime::now();
+        for there in [now - minutes(59), now, now + minutes(59)] {
+            signed(there).unwrap();
+            holds(there).unwrap();
+        }
+        // And no further: who was not a member yet is not let in, nor who is none any more.
+        assert!(signed(now - minutes(61)).is_err() && holds(now - minutes(61)).is_err());
+        assert!(signed(now + IDENTITY_LIFETIME - minutes(1)).is_ok());
+        assert!(signed(now + IDENTITY_LIFETIME + minutes(1)).is_err());
+        assert!(holds(now + minutes(24 * 60 + 1)).is_err());
+    }
+}
