@@ -122,7 +122,7 @@ pub struct PairSums {
     sum: Vec<i64>,
     sum_of_squares: Vec<u64>,
     at_least_observed: Vec<u32>,
-    /// The largest X of each iteration over these pairs.
+    /// The largest X of each iteration over these pairs; its keys say which iterations are in.
     maxima: BTreeMap<u64, i32>,
 }
 
@@ -139,11 +139,7 @@ impl PairSums {
         at_least_observed: Vec<u32>,
         maxima: BTreeMap<u64, i32>,
     ) -> Result<Self, NullModelError> {
-        for length in [sum_of_squares.len(), at_least_observed.len()] {
-            if length != sum.len() {
-                return Err(NullModelError::Pairs { ours: sum.len(), theirs: length });
-            }
-        }
+        same_pairs(sum.len(), &[sum_of_squares.len(), at_least_observed.len()])?;
         let end = first_place.saturating_add(sum.len());
         if end > pair_count(l) {
             return Err(NullModelError::Pairs { ours: pair_count(l), theirs: end });
@@ -170,36 +166,23 @@ impl PairSums {
     }
 }
 
-impl From<Accumulators> for PairSums {
-    fn from(all: Accumulators) -> Self {
-        let Accumulators { l, sum, sum_of_squares, at_least_observed, maxima } = all;
-        Self { l, first_place: 0, sum, sum_of_squares, at_least_observed, maxima }
-    }
-}
-
 /// Sums over iterations for all pairs, in the order of [`PairIndex::place`].
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Accumulators {
-    l: usize,
-    sum: Vec<i64>,
-    sum_of_squares: Vec<u64>,
-    at_least_observed: Vec<u32>,
-    /// The largest X of each iteration over all pairs; its keys say which iterations are in.
-    maxima: BTreeMap<u64, i32>,
-}
+pub struct Accumulators(PairSums);
 
 impl Accumulators {
     /// Empty sums for `l` columns.
     #[must_use]
     pub fn new(l: usize) -> Self {
         let pairs = pair_count(l);
-        Self {
+        Self(PairSums {
             l,
+            first_place: 0,
             sum: vec![0; pairs],
             sum_of_squares: vec![0; pairs],
             at_least_observed: vec![0; pairs],
             maxima: BTreeMap::new(),
-        }
+        })
     }
 
     /// Sums as a job returns them or a file keeps them; `maxima` says which iterations they are of.
@@ -213,15 +196,8 @@ impl Accumulators {
         at_least_observed: Vec<u32>,
         maxima: BTreeMap<u64, i32>,
     ) -> Result<Self, NullModelError> {
-        let pairs = pair_count(l);
-        for length in [sum.len(), sum_of_squares.len(), at_least_observed.len()] {
-            if length != pairs {
-                return Err(NullModelError::Pairs { ours: pairs, theirs: length });
-            }
-        }
-        let PairSums { sum, sum_of_squares, at_least_observed, maxima, .. } =
-            PairSums::new(l, 0, sum, sum_of_squares, at_least_observed, maxima)?;
-        Ok(Self { l, sum, sum_of_squares, at_least_observed, maxima })
+        same_pairs(pair_count(l), &[sum.len(), sum_of_squares.len(), at_least_observed.len()])?;
+        PairSums::new(l, 0, sum, sum_of_squares, at_least_observed, maxima).map(Self)
     }
 
     /// Adds one iteration's scores.
@@ -230,19 +206,21 @@ impl Accumulators {
     /// The iteration is in already, a slice has another number of pairs, or a sum leaves 64 bits; the sums are then not to be
     /// used any more.
     pub fn add(&mut self, iteration: u64, scores: &[i32], observed: &[i32]) -> Result<(), NullModelError> {
-        for slice in [scores, observed] {
-            if slice.len() != self.sum.len() {
-                return Err(NullModelError::Pairs { ours: self.sum.len(), theirs: slice.len() });
-            }
-        }
-        if self.maxima.contains_key(&iteration) {
+        same_pairs(self.0.pairs(), &[scores.len(), observed.len()])?;
+        if self.0.maxima.contains_key(&iteration) {
             return Err(NullModelError::Doubled { iteration });
         }
-        self.maxima.insert(iteration, scores.iter().copied().max().unwrap_or(0));
+        self.0.maxima.insert(iteration, scores.iter().copied().max().unwrap_or(0));
         for (place, (score, seen)) in scores.iter().zip(observed).enumerate() {
             let magnitude = u64::from(score.unsigned_abs());
             let reached = u32::from(score >= seen);
-            self.add_at(place, i64::from(*score), magnitude * magnitude, reached)?;
+            let sums = (
+                &mut self.0.sum[place],
+                &mut self.0.sum_of_squares[place],
+                &mut self.0.at_least_observed[place],
+            );
+            let more = (i64::from(*score), magnitude * magnitude, reached);
+            add_to(sums, more).ok_or_else(|| self.overflow(place))?;
         }
         Ok(())
     }
@@ -252,7 +230,7 @@ impl Accumulators {
     /// # Errors
     /// An iteration is in both, the alignments differ, or a sum leaves 64 bits; the sums are then not to be used any more.
     pub fn merge(&mut self, other: Self) -> Result<(), NullModelError> {
-        self.merge_parts(vec![other.into()])
+        self.merge_parts(vec![other.0])
     }
 
     /// Takes in the sums of other iterations, the same for all parts, which together are of all pairs. The order of parts and of
@@ -265,17 +243,17 @@ impl Accumulators {
         parts.sort_by_key(|part| part.first_place);
         let mut covered = 0;
         for part in &parts {
-            if part.l != self.l || part.first_place != covered {
+            if part.l != self.0.l || part.first_place != covered {
                 break;
             }
             covered += part.pairs();
         }
         let named: usize = parts.iter().map(PairSums::pairs).sum();
-        if covered != self.sum.len() || named != covered {
-            return Err(NullModelError::Pairs { ours: self.sum.len(), theirs: named });
+        if covered != self.0.pairs() || named != covered {
+            return Err(NullModelError::Pairs { ours: self.0.pairs(), theirs: named });
         }
         let Some(first) = parts.first() else { return Ok(()) };
-        if let Some(iteration) = first.maxima.keys().find(|iteration| self.maxima.contains_key(iteration)) {
+        if let Some(iteration) = first.maxima.keys().find(|iteration| self.0.maxima.contains_key(iteration)) {
             return Err(NullModelError::Doubled { iteration: *iteration });
         }
         if let Some(other) = parts.iter().find(|part| !part.maxima.keys().eq(first.maxima.keys())) {
@@ -283,7 +261,7 @@ impl Accumulators {
         }
         for part in &parts {
             for (&iteration, &largest) in &part.maxima {
-                self.maxima.entry(iteration).and_modify(|x| *x = largest.max(*x)).or_insert(largest);
+                self.0.maxima.entry(iteration).and_modify(|x| *x = largest.max(*x)).or_insert(largest);
             }
         }
         let overflown = parts.iter().find_map(|part| self.add_part(part));
@@ -294,9 +272,9 @@ impl Accumulators {
     fn add_part(&mut self, part: &PairSums) -> Option<usize> {
         let places = part.first_place..part.first_place + part.pairs();
         let ours = (
-            &mut self.sum[places.clone()],
-            &mut self.sum_of_squares[places.clone()],
-            &mut self.at_least_observed[places.clone()],
+            &mut self.0.sum[places.clone()],
+            &mut self.0.sum_of_squares[places.clone()],
+            &mut self.0.at_least_observed[places.clone()],
         );
         let theirs = (&part.sum, &part.sum_of_squares, &part.at_least_observed);
         (ours.0, ours.1, ours.2, theirs.0, theirs.1, theirs.2)
@@ -304,49 +282,46 @@ impl Accumulators {
             .with_min_len(PAIRS_A_CORE)
             .zip(places)
             .filter_map(|((sum, squares, reached, more, more_squares, more_reached), place)| {
-                let sums = sum
-                    .checked_add(*more)
-                    .zip(squares.checked_add(*more_squares))
-                    .zip(reached.checked_add(*more_reached));
-                match sums {
-                    Some(added) => {
-                        ((*sum, *squares), *reached) = added;
-                        None
-                    }
-                    None => Some(place),
-                }
+                let added = add_to((sum, squares, reached), (*more, *more_squares, *more_reached));
+                added.is_none().then_some(place)
             })
             .min()
+    }
+
+    /// As the one part that they are.
+    #[must_use]
+    pub fn into_pair_sums(self) -> PairSums {
+        self.0
     }
 
     /// Number of iterations summed.
     #[must_use]
     pub fn iterations(&self) -> usize {
-        self.maxima.len()
+        self.0.maxima.len()
     }
 
     /// Sum of X of each pair.
     #[must_use]
     pub fn sum(&self) -> &[i64] {
-        &self.sum
+        &self.0.sum
     }
 
     /// Sum of X^2 of each pair.
     #[must_use]
     pub fn sum_of_squares(&self) -> &[u64] {
-        &self.sum_of_squares
+        &self.0.sum_of_squares
     }
 
     /// How many iterations reached each pair's observed X.
     #[must_use]
     pub fn at_least_observed(&self) -> &[u32] {
-        &self.at_least_observed
+        &self.0.at_least_observed
     }
 
     /// The largest X of each iteration.
     #[must_use]
     pub fn maxima(&self) -> &BTreeMap<u64, i32> {
-        &self.maxima
+        &self.0.maxima
     }
 
     /// The pair with the highest Z so far, as a run goes on: `observed` holds the observed scores. `None` while no pair's null
@@ -356,12 +331,12 @@ impl Accumulators {
     /// There is not one observed score for each pair.
     #[must_use]
     pub fn leading(&self, observed: &[i32]) -> Option<(PairIndex, f64)> {
-        assert_eq!(observed.len(), self.sum.len(), "one score for each pair");
+        assert_eq!(observed.len(), self.0.pairs(), "one score for each pair");
         let z = |place: usize| {
-            let (mean, sd) = moments(self.sum[place], self.sum_of_squares[place], self.iterations());
+            let (mean, sd) = moments(self.0.sum[place], self.0.sum_of_squares[place], self.iterations());
             (sd > 0.0).then(|| (f64::from(observed[place]) - mean) / sd)
         };
-        PairIndex::all(self.l)
+        PairIndex::all(self.0.l)
             .enumerate()
             .filter_map(|(place, pair)| Some((pair, z(place)?)))
             .max_by(|(_, first), (_, second)| first.total_cmp(second))
@@ -374,13 +349,13 @@ impl Accumulators {
     #[must_use]
     pub fn statistics(&self, null: &NullModel<'_, '_>) -> Vec<PairStatistics> {
         let reference = null.reference;
-        assert_eq!(self.l, reference.alignment().l(), "sums and null model are of one alignment");
+        assert_eq!(self.0.l, reference.alignment().l(), "sums and null model are of one alignment");
         let runs = self.iterations();
-        PairIndex::all(self.l)
+        PairIndex::all(self.0.l)
             .enumerate()
             .map(|(place, PairIndex { i, j })| {
                 let observed = reference.observed()[place];
-                let (mean, sd) = moments(self.sum[place], self.sum_of_squares[place], runs);
+                let (mean, sd) = moments(self.0.sum[place], self.0.sum_of_squares[place], runs);
                 let undefined = reference.is_constant(i) || reference.is_constant(j) || sd == 0.0;
                 let distance = f64::from(observed) - mean;
                 PairStatistics {
@@ -391,30 +366,29 @@ impl Accumulators {
                     null_sd_bits: reference.bits(sd),
                     z: if undefined { 0.0 } else { distance / sd },
                     z_undefined: undefined,
-                    p: (1.0 + f64::from(self.at_least_observed[place])) / (runs as f64 + 1.0),
+                    p: (1.0 + f64::from(self.0.at_least_observed[place])) / (runs as f64 + 1.0),
                 }
             })
             .collect()
     }
 
-    fn add_at(&mut self, place: usize, sum: i64, squares: u64, reached: u32) -> Result<(), NullModelError> {
-        let sums = self.sum[place]
-            .checked_add(sum)
-            .zip(self.sum_of_squares[place].checked_add(squares))
-            .zip(self.at_least_observed[place].checked_add(reached));
-        let Some(((sum, squares), reached)) = sums else {
-            return Err(self.overflow(place));
-        };
-        self.sum[place] = sum;
-        self.sum_of_squares[place] = squares;
-        self.at_least_observed[place] = reached;
-        Ok(())
-    }
-
     fn overflow(&self, place: usize) -> NullModelError {
-        let pair = pair_at(self.l, place);
+        let pair = pair_at(self.0.l, place);
         NullModelError::Overflow { i: pair.i, j: pair.j, iterations: self.iterations() }
     }
+}
+
+fn same_pairs(ours: usize, lengths: &[usize]) -> Result<(), NullModelError> {
+    let other = lengths.iter().find(|length| **length != ours);
+    other.map_or(Ok(()), |&theirs| Err(NullModelError::Pairs { ours, theirs }))
+}
+
+/// Adds to a pair's sums: sum of X, sum of squares, count. `None` if one leaves its integer; then none is changed.
+fn add_to(sums: (&mut i64, &mut u64, &mut u32), more: (i64, u64, u32)) -> Option<()> {
+    let (sum, squares) = (sums.0.checked_add(more.0)?, sums.1.checked_add(more.1)?);
+    *sums.2 = sums.2.checked_add(more.2)?;
+    (*sums.0, *sums.1) = (sum, squares);
+    Some(())
 }
 
 fn pair_at(l: usize, place: usize) -> PairIndex {

@@ -42,6 +42,23 @@ fn reduce(shape: &Shape, seed: u64, iterations: Range<u64>) -> MiJob {
     MiJob { seed: Seed(seed), pass: Pass::Reduce { iterations, chunks } }
 }
 
+/// The sums of as many jobs as there are parts, each of these chunks.
+fn sums_of_parts(
+    device: &Device,
+    reference: &Reference<'_>,
+    shape: &Shape,
+    (seed, iterations): (u64, Range<u64>),
+    parts: impl IntoIterator<Item = Range<usize>>,
+) -> Accumulators {
+    let of_parts = parts.into_iter().map(|chunks| {
+        let job = MiJob { seed: Seed(seed), pass: Pass::Reduce { iterations: iterations.clone(), chunks } };
+        device.part(reference, shape, &job)
+    });
+    let mut sums = Accumulators::new(reference.alignment().l());
+    sums.merge_parts(of_parts.collect()).unwrap();
+    sums
+}
+
 #[test]
 fn random_alignments_give_the_hosts_bits() {
     let device = Device::open(COARSE);
@@ -131,13 +148,8 @@ fn several_blocks_chunks_and_cuts_do_not_show() {
     assert!(coarse.observed(&reference, &chunked) == reference.observed(), "chunks show in observed scores");
     assert!(coarse.sums(&reference, &whole, &reduce(&whole, 9, 7..9)) == host, "one binding");
     // Jobs of a part of the pairs each, as large alignments have them.
-    let mut parts = Accumulators::new(alignment.l());
-    let middle = 1..chunked.chunks().len() - 1;
-    let of_chunks = [0..1, middle.clone(), middle.end..middle.end + 1].map(|chunks| {
-        let job = MiJob { seed: Seed(9), pass: Pass::Reduce { iterations: 7..9, chunks } };
-        coarse.part(&reference, &chunked, &job)
-    });
-    parts.merge_parts(of_chunks.into()).unwrap();
+    let last = chunked.chunks().len() - 1;
+    let parts = sums_of_parts(&coarse, &reference, &chunked, (9, 7..9), [0..1, 1..last, last..last + 1]);
     assert!(parts == host, "jobs of some of the pairs");
     let fine = Device::open(Duration::from_millis(1));
     assert!(fine.sums(&reference, &chunked, &reduce(&chunked, 9, 7..9)) == host, "many bindings, many cuts");
@@ -155,12 +167,7 @@ fn large_alignments_come_in_parts_of_their_pairs() {
     assert_eq!(first + second, shape.pairs());
     assert!(first.abs_diff(second) <= 2 * alignment.l(), "{first} and {second} pairs");
     let device = Device::open(COARSE);
-    let of_parts = parts.into_iter().map(|chunks| {
-        let job = MiJob { seed: Seed(3), pass: Pass::Reduce { iterations: 1..3, chunks } };
-        device.part(&reference, &shape, &job)
-    });
-    let mut sums = Accumulators::new(alignment.l());
-    sums.merge_parts(of_parts.collect()).unwrap();
+    let sums = sums_of_parts(&device, &reference, &shape, (3, 1..3), parts);
     assert!(sums == NullModel::new(&reference, Seed(3), ShuffleKind::Feistel).run(1..3).unwrap());
 }
 

@@ -7,7 +7,7 @@
 
 use super::{
     CoordinatorMachine,
-    model::{JobState, Node, Pending},
+    model::{Device, JobState, Node, Pending},
     neighbours::{Estimates, Place},
     placement::{load_amount, told_load},
     policy::{History, LongestFirst, Packed, PlacementPolicy as _, Policy, Question},
@@ -147,15 +147,13 @@ impl CoordinatorMachine {
     }
 
     /// A device may have nothing left: then the next part is due of every batch that it takes jobs of, whosever its last one was.
-    pub(super) fn runs_dry(&mut self, (id, index): Place) {
+    pub(super) fn runs_dry(&mut self, place: Place) {
         if self.reserved.is_empty() {
             return;
         }
-        let Some(node) = self.nodes.get(&id).filter(|node| node.takes_work()) else { return };
-        let Some(device) = node.devices.get(usize::from(index.0)) else { return };
-        if device.planned_jobs > 0 || device.lost {
-            return;
-        }
+        let takes_work = self.nodes.get(&place.0).is_some_and(Node::takes_work);
+        let is_idle = |device: &&Device| takes_work && !device.lost && device.planned_jobs == 0;
+        let Some(device) = self.device(place).filter(is_idle) else { return };
         let fits = |(app, batch): &(AppId, BatchId)| {
             let batch = self.apps.get(app).and_then(|app| app.batches.get(batch));
             batch.is_some_and(|batch| batch.needs.fulfilled_by(&device.info))

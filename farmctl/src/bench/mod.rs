@@ -46,7 +46,7 @@ pub(crate) enum Better {
 #[derive(Clone, Debug, Serialize)]
 pub(crate) struct Figure {
     /// What was measured.
-    pub figure: &'static str,
+    pub figure: String,
     /// The measurement.
     pub value: f64,
     /// Its unit.
@@ -62,7 +62,7 @@ pub(crate) struct Figure {
 impl Figure {
     /// Judges a measurement.
     pub(crate) fn new(
-        figure: &'static str,
+        figure: impl Into<String>,
         value: f64,
         unit: &'static str,
         better: Better,
@@ -72,7 +72,7 @@ impl Figure {
             Better::Higher => value >= bar,
             Better::Lower => value <= bar,
         };
-        Self { figure, value, unit, bar, better, ok }
+        Self { figure: figure.into(), value, unit, bar, better, ok }
     }
 
     /// The worse of two measurements of one figure; one that is no number is the worst.

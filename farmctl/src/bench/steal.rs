@@ -47,12 +47,14 @@ const SCORE_ERROR: f64 = 2.0;
 /// Jobs before the clock starts: enough that every node gets one, whatever its score.
 const WARM_UP_JOBS: usize = 512;
 
-/// What may steal, in the order of the tables' columns.
-const MODES: [(&str, Stealing, Stealing); 4] = [
-    ("none", Stealing::Off, Stealing::Off),
-    ("global only", Stealing::Off, Stealing::On),
-    ("local only", Stealing::On, Stealing::Off),
-    ("full", Stealing::On, Stealing::On),
+/// What may steal and how jobs are placed: the tables' columns in their order, then what a render gets, and its second frame.
+const MODES: [(&str, Stealing, Stealing, &str); 6] = [
+    ("none", Stealing::Off, Stealing::Off, FCFS),
+    ("global only", Stealing::Off, Stealing::On, FCFS),
+    ("local only", Stealing::On, Stealing::Off, FCFS),
+    ("full", Stealing::On, Stealing::On, FCFS),
+    ("render", Stealing::On, Stealing::On, NEIGHBOURS),
+    ("second frame", Stealing::On, Stealing::On, HISTORY),
 ];
 const NONE: usize = 0;
 const FULL: usize = 3;
@@ -66,12 +68,8 @@ struct Setting {
     thesis_s: [f64; 4],
     /// What the thesis gains, over runs without stealing; `fcfs` with all of it, and what a render gets, should gain more.
     gain_bar: f64,
-    gain: &'static str,
-    render_gain: &'static str,
-    /// Makespans over the lower bound: of `fcfs` with all stealing, of what a render gets, of the second frame.
-    fcfs: &'static str,
-    render: &'static str,
-    second_frame: &'static str,
+    /// What figures call it.
+    key: &'static str,
 }
 
 /// A simulated device and what it announces.
@@ -84,7 +82,7 @@ struct SimDevice {
 /// Measures all settings.
 pub(super) async fn measure(seed: u64, runs: usize, pictures: Option<&Path>) -> anyhow::Result<Vec<Figure>> {
     let mut figures = Vec::new();
-    let [none, global, local, full] = MODES.map(|(mode, ..)| mode);
+    let [none, global, local, full, render, second_frame] = MODES.map(|(mode, ..)| mode);
     let mut table = output::table([
         "",
         none,
@@ -94,36 +92,24 @@ pub(super) async fn measure(seed: u64, runs: usize, pictures: Option<&Path>) -> 
         "full/none",
         "lower bound",
         "one queue",
-        "render",
-        "second frame",
+        render,
+        second_frame,
     ]);
     let mut gaps = Gaps::default();
     for setting in settings(seed) {
         let tiles = setting.scene.tiles(seed);
-        let mut makespans_ms: [Vec<f64>; 4] = Default::default();
-        let mut renders_ms = Vec::new();
-        let mut second_frames_ms = Vec::new();
+        let mut makespans_ms: [Vec<f64>; MODES.len()] = Default::default();
         // The modes take turns: what else the machine does meets all of them.
         for _ in 0..runs {
-            for (makespans_ms, (mode, local, global)) in makespans_ms.iter_mut().zip(MODES) {
-                let ran = run(&setting.devices, &tiles, local, global, FCFS).await?;
-                makespans_ms.push(ran.makespan_ms);
-                if (local, global) == (Stealing::On, Stealing::On) {
+            for (index, (mode, local, global, policy)) in MODES.into_iter().enumerate() {
+                let ran = run(&setting.devices, &tiles, local, global, policy).await?;
+                makespans_ms[index].push(ran.makespan_ms);
+                if index == FULL {
                     gaps.take(&ran.timeline.segments);
                 }
                 if let Some(folder) = pictures {
                     draw(folder, &format!("{}, {mode}", setting.name), &ran.timeline)?;
                 }
-            }
-            let render = run(&setting.devices, &tiles, Stealing::On, Stealing::On, NEIGHBOURS).await?;
-            renders_ms.push(render.makespan_ms);
-            if let Some(folder) = pictures {
-                draw(folder, &format!("{}, render", setting.name), &render.timeline)?;
-            }
-            let told = run(&setting.devices, &tiles, Stealing::On, Stealing::On, HISTORY).await?;
-            second_frames_ms.push(told.makespan_ms);
-            if let Some(folder) = pictures {
-                draw(folder, &format!("{}, second frame", setting.name), &told.timeline)?;
             }
         }
         let medians_ms = makespans_ms.map(|makespans_ms| median(&makespans_ms));
@@ -131,25 +117,23 @@ pub(super) async fn measure(seed: u64, runs: usize, pictures: Option<&Path>) -> 
         let speeds: Vec<f64> = setting.devices.iter().map(|device| device.speed).collect();
         let bound_ms = lower_bound(&jobs_ms, &speeds);
         let one_queue_ms = one_queue(&jobs_ms, &speeds);
-        let render_ms = median(&renders_ms);
-        let second_frame_ms = median(&second_frames_ms);
+        let [none_ms, global_ms, local_ms, full_ms, render_ms, second_frame_ms] = medians_ms;
         let row = |name: String, runtimes: [f64; 4], unit: &str, rest: [String; 4]| {
             let gain = runtimes[FULL] / runtimes[NONE];
             let runtimes = runtimes.map(|runtime| format!("{runtime:.0} {unit}"));
             [vec![name], runtimes.into(), vec![format!("{gain:.3}")], rest.into()].concat()
         };
         let reference = [bound_ms, one_queue_ms, render_ms, second_frame_ms].map(|ms| format!("{ms:.0} ms"));
-        table.add_row(row(setting.name.to_owned(), medians_ms, "ms", reference));
+        let runtimes_ms = [none_ms, global_ms, local_ms, full_ms];
+        table.add_row(row(setting.name.to_owned(), runtimes_ms, "ms", reference));
         table.add_row(row("  thesis".to_owned(), setting.thesis_s, "s", Default::default()));
-        for (name, ms) in [(setting.gain, medians_ms[FULL]), (setting.render_gain, render_ms)] {
-            let gain = ms / medians_ms[NONE];
-            figures.push(Figure::new(name, gain, "ratio", Better::Lower, setting.gain_bar));
+        let key = setting.key;
+        for (name, ms) in [(format!("steal_gain_{key}"), full_ms), (format!("render_gain_{key}"), render_ms)]
+        {
+            figures.push(Figure::new(name, ms / none_ms, "ratio", Better::Lower, setting.gain_bar));
         }
-        for (name, ms) in [
-            (setting.render, render_ms),
-            (setting.second_frame, second_frame_ms),
-            (setting.fcfs, medians_ms[FULL]),
-        ] {
+        for (suffix, ms) in [("", render_ms), ("_second_frame", second_frame_ms), ("_fcfs", full_ms)] {
+            let name = format!("makespan_ratio_{key}{suffix}");
             figures.push(Figure::new(name, ms / bound_ms, "ratio", Better::Lower, 1.04));
         }
     }
@@ -172,11 +156,7 @@ fn settings(seed: u64) -> [Setting; 3] {
             devices: equal.clone(),
             thesis_s: [227.105, 203.453, 212.26, 201.597],
             gain_bar: 0.888,
-            gain: "steal_gain_kitchen",
-            render_gain: "render_gain_kitchen",
-            fcfs: "makespan_ratio_kitchen_fcfs",
-            render: "makespan_ratio_kitchen",
-            second_frame: "makespan_ratio_kitchen_second_frame",
+            key: "kitchen",
         },
         Setting {
             name: "mustang",
@@ -184,11 +164,7 @@ fn settings(seed: u64) -> [Setting; 3] {
             devices: equal,
             thesis_s: [236.324, 193.776, 210.258, 190.51],
             gain_bar: 0.806,
-            gain: "steal_gain_mustang",
-            render_gain: "render_gain_mustang",
-            fcfs: "makespan_ratio_mustang_fcfs",
-            render: "makespan_ratio_mustang",
-            second_frame: "makespan_ratio_mustang_second_frame",
+            key: "mustang",
         },
         Setting {
             name: "mustang, unequal",
@@ -196,11 +172,7 @@ fn settings(seed: u64) -> [Setting; 3] {
             devices: unequal_devices(seed),
             thesis_s: [823.19, 708.16, 715.52, 681.53],
             gain_bar: 0.828,
-            gain: "steal_gain_heterogeneous",
-            render_gain: "render_gain_heterogeneous",
-            fcfs: "makespan_ratio_heterogeneous_fcfs",
-            render: "makespan_ratio_heterogeneous",
-            second_frame: "makespan_ratio_heterogeneous_second_frame",
+            key: "heterogeneous",
         },
     ]
 }

@@ -1,7 +1,7 @@
 //! The timeline in Chrome's trace event format, which <https://ui.perfetto.dev> opens: a process for each node, a
 //! thread for each device, a slice for each attempt, an arrow for each steal.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use farm_core::{
     coordinator::timeline::{Migration, Segment},
@@ -55,15 +55,12 @@ pub(crate) fn trace(chart: &Chart<'_>) -> Value {
 
 /// Numbers of the nodes, from 1: ids have 64 bits, and viewers take 32.
 fn processes(chart: &Chart<'_>) -> BTreeMap<NodeId, u32> {
-    let mut processes: BTreeMap<NodeId, u32> = chart.rows.keys().map(|&(node, _)| (node, 0)).collect();
-    for segment in &chart.timeline.segments {
-        processes.insert(segment.node, 0);
-        if let Some(Migration::Global { node, .. }) = segment.migration {
-            processes.insert(node, 0);
-        }
-    }
-    processes.values_mut().zip(1..).for_each(|(process, number)| *process = number);
-    processes
+    let victims = chart.timeline.segments.iter().filter_map(|segment| match segment.migration {
+        Some(Migration::Global { node, .. }) => Some(node),
+        Some(Migration::Local { .. }) | None => None,
+    });
+    let nodes: BTreeSet<NodeId> = chart.rows.keys().map(|&(node, _)| node).chain(victims).collect();
+    nodes.into_iter().zip(1..).collect()
 }
 
 fn slice(chart: &Chart<'_>, segment: &Segment, process: u32) -> Value {

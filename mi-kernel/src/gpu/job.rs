@@ -159,7 +159,7 @@ impl MiJob {
             for (iteration, scores) in self.iterations().zip(self.scores(shape, sections)?) {
                 sums.add(iteration, &scores, observed)?;
             }
-            return Ok(sums.into());
+            return Ok(sums.into_pair_sums());
         };
         let (_, chunks) = self.chunks(shape);
         let expected = chunks.len() * 3 + 1;
