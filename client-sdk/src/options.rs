@@ -3,14 +3,17 @@
 use std::time::Duration;
 
 use farm_core::coordinator::policy::FCFS;
-use proto::trust::Identity;
+use proto::{control::coordinator_addresses, trust::Identity};
 
 use crate::error::FarmError;
+
+/// Time for a coordinator's machine to start anew: what waits for it is worth more than the wait.
+const RECONNECT_TIMEOUT: Duration = Duration::from_secs(600);
 
 /// How an application connects, and the bounds it keeps.
 #[derive(Clone, Debug, PartialEq)]
 pub struct FarmOptions {
-    /// `host:port` of the coordinator.
+    /// `host:port` of the coordinator; where it has standbys theirs, too, with commas between.
     pub coordinator: String,
     /// The application's name, for people.
     pub name: String,
@@ -28,7 +31,7 @@ pub struct FarmOptions {
     pub identity: Option<Identity>,
     /// How long connecting and registering may take.
     pub connect_timeout: Duration,
-    /// How long a lost coordinator is tried again before the run ends.
+    /// How long a lost coordinator is tried again before the run ends. What nodes have goes on meanwhile, and its results come.
     pub reconnect_timeout: Duration,
     /// How long jobs may wait for a fitting device before the run ends.
     pub patience: Duration,
@@ -55,7 +58,7 @@ impl Default for Window {
 }
 
 impl FarmOptions {
-    /// Default settings: weight 1, no stealing between nodes, 5 s to connect, 30 s to reconnect, 60 s of patience.
+    /// Default settings: weight 1, no stealing between nodes, 5 s to connect, 10 minutes to reconnect, 60 s of patience.
     pub fn new(coordinator: impl Into<String>, name: impl Into<String>) -> Self {
         Self {
             coordinator: coordinator.into(),
@@ -65,7 +68,7 @@ impl FarmOptions {
             policy: FCFS.to_owned(),
             identity: None,
             connect_timeout: Duration::from_secs(5),
-            reconnect_timeout: Duration::from_secs(30),
+            reconnect_timeout: RECONNECT_TIMEOUT,
             patience: Duration::from_secs(60),
             window: Window::default(),
         }
@@ -74,9 +77,8 @@ impl FarmOptions {
     /// Refuses what cannot work, before anything is connected.
     pub(crate) fn check(&self) -> Result<(), FarmError> {
         let wrong = |option, reason: String| Err(FarmError::Options { option, reason });
-        match self.coordinator.rsplit_once(':') {
-            Some((host, port)) if !host.is_empty() && port.parse::<u16>().is_ok_and(|port| port > 0) => {}
-            _ => return wrong("coordinator", format!("`{}` is not HOST:PORT", self.coordinator)),
+        if let Err(error) = coordinator_addresses(&self.coordinator) {
+            return wrong("coordinator", error.to_string());
         }
         if !(self.weight.is_finite() && self.weight > 0.0) {
             return wrong("weight", format!("{} is not a positive number", self.weight));
@@ -97,11 +99,14 @@ mod tests {
         let good = FarmOptions::new("127.0.0.1:7700", "test");
         good.check().unwrap();
         FarmOptions::new("[::1]:7700", "test").check().unwrap();
+        FarmOptions::new("one:7700,two:7700", "test").check().unwrap();
         let option = |options: FarmOptions| match options.check() {
             Err(FarmError::Options { option, .. }) => option,
             other => panic!("expected a refused option, got {other:?}"),
         };
-        for address in ["", "localhost", ":7700", "host:", "host:0", "host:65536", "host:port"] {
+        for address in
+            ["", "localhost", ":7700", "host:", "host:0", "host:65536", "host:port", "host:1,", "host:1,host"]
+        {
             assert_eq!(option(FarmOptions::new(address, "test")), "coordinator", "{address}");
         }
         for weight in [0.0, -1.0, f64::NAN, f64::INFINITY] {

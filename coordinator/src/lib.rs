@@ -6,6 +6,7 @@
 mod audit;
 mod identities;
 mod keeper;
+mod lead;
 mod owner;
 pub mod plugins;
 pub mod policy_host;
@@ -35,14 +36,18 @@ use tokio::{
     task::{JoinHandle, JoinSet},
 };
 
-pub use self::security::{AUTHORITY_FILE, initialise};
 use self::{
     keeper::Keeper,
+    lead::Lead,
     owner::{Owner, OwnerHandle},
     plugins::{PluginOptions, Plugins},
     security::{Gate, Security, TrustService},
     sessions::Sessions,
     store::{Store, epoch_by_the_clock},
+};
+pub use self::{
+    lead::stand_by,
+    security::{AUTHORITY_FILE, initialise},
 };
 
 /// How long `shutdown` waits for connections to close by themselves before it cuts them.
@@ -57,6 +62,9 @@ pub struct CoordinatorOptions {
     pub http: SocketAddr,
     /// Where the epoch and members are kept; `None`: nowhere, the epoch is the time of the start.
     pub state: Option<PathBuf>,
+    /// The term of the leader that this coordinator follows, if [`stand_by`] gave one; its process may still have the state
+    /// directory open.
+    pub predecessor: Option<u64>,
     /// Whether members of the farm alone are let in, by the authority in the state directory.
     pub secured: bool,
     /// Whether everyone is let in though the state directory knows of members.
@@ -75,6 +83,7 @@ impl Default for CoordinatorOptions {
             listen: SocketAddr::from(([127, 0, 0, 1], 7700)),
             http: SocketAddr::from(([127, 0, 0, 1], 7701)),
             state: None,
+            predecessor: None,
             secured: false,
             insecure: false,
             liveness: Liveness::default(),
@@ -117,6 +126,9 @@ pub enum StartError {
         /// Why not.
         reason: String,
     },
+    /// Another coordinator took the lead that this one was about to take. It may stand by again.
+    #[error("another coordinator leads now")]
+    Outrun,
     /// The farm's authority or identities cannot be used.
     #[error("{0}")]
     Trust(String),
@@ -143,7 +155,7 @@ pub struct CoordinatorHandle {
     /// Owner, what writes for it, gRPC server, HTTP server.
     tasks: Vec<JoinHandle<()>>,
     /// Keeps the state directory locked.
-    _store: Option<Arc<Store>>,
+    store: Option<Arc<Store>>,
     /// Renews the coordinator's certificate; ends with the handle.
     renewal: JoinSet<()>,
 }
@@ -171,9 +183,20 @@ impl CoordinatorHandle {
         self.owner.drain(node).await
     }
 
-    /// Waits until the coordinator has stopped by itself: a broken invariant, never a peer's fault. Cancel-safe.
+    /// Waits until the coordinator has stopped by itself, for a broken invariant, never a peer's fault, or until another one has
+    /// taken its farm over: then it is to be dropped. The log says why. Cancel-safe.
     pub async fn stopped(&self) {
-        self.owner.stopped().await;
+        tokio::select! {
+            () = self.owner.stopped() => {}
+            () = self.taken_over() => {}
+        }
+    }
+
+    async fn taken_over(&self) {
+        match self.store.as_ref().and_then(|store| store.lead()) {
+            Some(lead) => lead.over().await,
+            None => std::future::pending().await,
+        }
     }
 
     /// Closes every session and waits (at most two seconds) until all is down.
@@ -213,7 +236,7 @@ pub async fn start(options: CoordinatorOptions) -> Result<CoordinatorHandle, Sta
         None => Plugins::none(),
     };
     // After the addresses: a second coordinator on them is refused without counting as a life.
-    let store = options.state.as_deref().map(Store::open).transpose()?.map(Arc::new);
+    let store = options.state.as_deref().map(|state| lead_by(state, &options)).transpose()?.map(Arc::new);
     let epoch = store.as_deref().map_or_else(|| Ok(epoch_by_the_clock()), Store::begin_epoch)?;
     let restored = store.as_deref().map_or_else(|| Ok(Restored::default()), Store::restore)?;
     // An open farm has one project, and no operator who could give it a quota.
@@ -269,16 +292,23 @@ pub async fn start(options: CoordinatorOptions) -> Result<CoordinatorHandle, Sta
     let http_task = tokio::spawn(serve_http(http, owner.clone(), servers_stop));
     tracing::info!(%epoch, grpc = %grpc_addr, http = %http_addr, secured = options.secured, "coordinator started");
     tasks.splice(0..0, [owner_task, grpc_task, http_task]);
-    Ok(CoordinatorHandle {
-        owner,
-        grpc_addr,
-        http_addr,
-        stop_owner,
-        stop_servers,
-        tasks,
-        _store: store,
-        renewal,
-    })
+    Ok(CoordinatorHandle { owner, grpc_addr, http_addr, stop_owner, stop_servers, tasks, store, renewal })
+}
+
+/// Opens the state directory as the one coordinator that leads by it.
+fn lead_by(directory: &Path, options: &CoordinatorOptions) -> Result<Store, StartError> {
+    let take = || Lead::take(directory, options.predecessor, options.liveness);
+    let (store, lead) = if options.predecessor.is_some() {
+        let lead = take()?;
+        // The predecessor may hold the lock, stopped as it is.
+        Store::copy_aside(directory)?;
+        (Store::open(directory)?, lead)
+    } else {
+        // Its lock says that nobody leads.
+        (Store::open(directory)?, take()?)
+    };
+    lead.forget_earlier();
+    Ok(store.led_by(lead))
 }
 
 async fn listen(what: &'static str, address: SocketAddr) -> Result<(TcpListener, SocketAddr), StartError> {

@@ -6,11 +6,11 @@ use std::{io::Write as _, process::ExitCode};
 
 use anyhow::Context as _;
 use clap::Parser as _;
-use coordinator::CoordinatorOptions;
+use coordinator::{CoordinatorHandle, CoordinatorOptions, StartError};
 use tokio::signal::unix::{Signal, SignalKind, signal};
 use tracing_subscriber::EnvFilter;
 
-use self::settings::{Arguments, Role};
+use self::settings::{Arguments, Role, Settings};
 
 /// Something failed.
 const EXIT_FAILED: u8 = 1;
@@ -30,11 +30,11 @@ fn main() -> ExitCode {
         .with_writer(std::io::stderr)
         .log_internal_errors(false)
         .init();
-    let options = match settings::options(arguments) {
-        Ok(options) => options,
+    let settings = match settings::settings(arguments) {
+        Ok(settings) => settings,
         Err(error) => return failed(EXIT_USAGE, &error),
     };
-    match run(options) {
+    match run(settings) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => failed(EXIT_FAILED, &error),
     }
@@ -47,7 +47,7 @@ fn failed(code: u8, error: &anyhow::Error) -> ExitCode {
 }
 
 #[tokio::main]
-async fn run(options: CoordinatorOptions) -> anyhow::Result<()> {
+async fn run(Settings { options, standby }: Settings) -> anyhow::Result<()> {
     // Before anything is started: a signal during the start is not lost.
     let mut interrupt = signal(SignalKind::interrupt()).context("cannot listen for SIGINT")?;
     let mut terminate = signal(SignalKind::terminate()).context("cannot listen for SIGTERM")?;
@@ -61,7 +61,10 @@ async fn run(options: CoordinatorOptions) -> anyhow::Result<()> {
             );
         }
     }
-    let handle = coordinator::start(options).await?;
+    let handle = tokio::select! {
+        started = start(options, standby) => started?,
+        () = asked_to_end(&mut interrupt, &mut terminate) => return Ok(()),
+    };
     let ready = serde_json::json!({
         "event": "ready",
         "grpc": handle.grpc_addr().to_string(),
@@ -71,12 +74,30 @@ async fn run(options: CoordinatorOptions) -> anyhow::Result<()> {
 
     tokio::select! {
         () = asked_to_end(&mut interrupt, &mut terminate) => {}
-        () = handle.stopped() => anyhow::bail!("the coordinator stopped by itself; the log says why"),
+        () = handle.stopped() => anyhow::bail!("the coordinator ends; the log says why"),
     }
     tracing::info!("ending; a second signal ends at once");
     tokio::select! {
         () = handle.shutdown() => Ok(()),
         () = asked_to_end(&mut interrupt, &mut terminate) => anyhow::bail!("ended before every session was closed"),
+    }
+}
+
+/// Starts the coordinator; a standby once nobody leads.
+async fn start(mut options: CoordinatorOptions, standby: bool) -> anyhow::Result<CoordinatorHandle> {
+    let directory = options.state.clone().filter(|_| standby);
+    if directory.is_some() {
+        writeln!(std::io::stdout(), r#"{{"event":"standby"}}"#).context("cannot write to stdout")?;
+    }
+    loop {
+        if let Some(directory) = &directory {
+            options.predecessor = coordinator::stand_by(directory, options.liveness).await?;
+        }
+        match coordinator::start(options.clone()).await {
+            // Another standby was faster.
+            Err(StartError::Outrun) if standby => {}
+            started => return Ok(started?),
+        }
     }
 }
 

@@ -556,7 +556,7 @@ async fn on_disk<T: Send + 'static>(
     match tokio::task::spawn_blocking(work).await {
         Ok(Ok(done)) => Ok(done),
         Ok(Err(StoreError::Denied(reason))) => Err(Status::permission_denied(reason)),
-        Ok(Err(error @ StoreError::Broken(_))) => {
+        Ok(Err(error @ (StoreError::Broken(_) | StoreError::Superseded(_)))) => {
             tracing::error!(%error, "a request failed");
             Err(Status::internal(error.to_string()))
         }

@@ -38,6 +38,17 @@ pub(crate) struct Arguments {
     /// has secured lets members of the farm alone in.
     #[arg(long, value_name = "DIR", env = "GLEANER_STATE")]
     state: Option<PathBuf>,
+    /// Wait, without listening anywhere, while another coordinator leads by this state directory, and take over when it is gone
+    /// or silent (docs/standby.md).
+    #[arg(
+        long,
+        env = "GLEANER_STANDBY",
+        num_args = 0..=1,
+        default_missing_value = "true",
+        require_equals = true,
+        value_parser = clap::builder::BoolishValueParser::new()
+    )]
+    standby: Option<bool>,
     /// How soon silence counts [default: default].
     #[arg(long, value_enum, env = "GLEANER_LIVENESS")]
     liveness: Option<Profile>,
@@ -100,6 +111,7 @@ struct ConfigFile {
     http: Option<String>,
     state: Option<PathBuf>,
     insecure: Option<bool>,
+    standby: Option<bool>,
     /// How long a vanished application keeps its jobs, in milliseconds.
     app_lease_ms: Option<u64>,
     /// The folder of plug-in policies.
@@ -120,8 +132,16 @@ struct LivenessTable {
     compare_ms: Option<u64>,
 }
 
-/// Checked options from everything the user said. Every error is a usage error and names flag, file or key.
-pub(crate) fn options(arguments: Arguments) -> anyhow::Result<CoordinatorOptions> {
+/// What the user wants.
+#[derive(Debug)]
+pub(crate) struct Settings {
+    pub(crate) options: CoordinatorOptions,
+    /// Whether to wait for the lead.
+    pub(crate) standby: bool,
+}
+
+/// Checked settings from everything the user said. Every error is a usage error and names flag, file or key.
+pub(crate) fn settings(arguments: Arguments) -> anyhow::Result<Settings> {
     let file = arguments.config.as_deref().map(read_config).transpose()?.unwrap_or_default();
     let defaults = CoordinatorOptions::default();
     let listen = address("listen", arguments.listen.or(file.listen), defaults.listen)?;
@@ -137,8 +157,10 @@ pub(crate) fn options(arguments: Arguments) -> anyhow::Result<CoordinatorOptions
             );
         }
     }
+    let standby = arguments.standby.or(file.standby).unwrap_or(false);
+    ensure!(!standby || state.is_some(), "--standby needs --state, the directory that coordinators share");
     let plugins = env::var_os(PLUGINS_VARIABLE).map(PathBuf::from).or(file.plugins);
-    Ok(CoordinatorOptions {
+    let options = CoordinatorOptions {
         listen,
         http,
         // One that is there and cannot be read is an error later, not a farm without members.
@@ -146,10 +168,12 @@ pub(crate) fn options(arguments: Arguments) -> anyhow::Result<CoordinatorOptions
             && state.as_ref().is_some_and(|state| state.join(AUTHORITY_FILE).symlink_metadata().is_ok()),
         insecure,
         state,
+        predecessor: None,
         liveness: liveness(arguments.liveness, &file.liveness)?,
         app_lease_ms: file.app_lease_ms.unwrap_or(defaults.app_lease_ms),
         plugins: plugins.map(hosted_here).transpose()?,
-    })
+    };
+    Ok(Settings { options, standby })
 }
 
 /// Plug-ins run in further processes of this executable.
@@ -214,7 +238,7 @@ mod tests {
         if let Some(config) = &config {
             arguments.config = Some(config.path().to_owned());
         }
-        options(arguments)
+        settings(arguments).map(|settings| settings.options)
     }
 
     #[test]
@@ -255,7 +279,8 @@ mod tests {
 
     #[test]
     fn errors_name_the_place() {
-        let cases: [(&[&str], Option<&str>, &[&str]); 9] = [
+        let cases: [(&[&str], Option<&str>, &[&str]); 10] = [
+            (&["--standby"], None, &["--standby", "--state"]),
             (&[], Some("http = '127.0.0.1:0'\nlisen = 'x'\n"), &["config file", "line 2", "lisen"]),
             (&[], Some("[liveness]\nprofile = 'fast'\n"), &["config file", "line 2", "fast"]),
             (&[], Some("listen = 5\n"), &["config file", "line 1", "string"]),

@@ -12,7 +12,7 @@ use std::{
     ops::Not as _,
     panic::catch_unwind,
     path::{Path, PathBuf},
-    sync::{PoisonError, RwLock},
+    sync::{Arc, PoisonError, RwLock},
     time::SystemTime,
 };
 
@@ -29,10 +29,12 @@ use self::{
     projects::{BELONGING, PROJECTS},
     soft::{SPEEDS, STOPPED},
 };
-use crate::StartError;
+use crate::{StartError, lead::Lead};
 
 /// The database in the state directory.
 const FILE: &str = "control.redb";
+/// What is to take its place.
+const COPY: &str = "control.redb.copy";
 /// What it keeps in memory, in bytes: it is read at joins and new sessions.
 const CACHE_BYTES: usize = 1 << 20;
 /// Where versions before the database kept the epoch.
@@ -82,6 +84,9 @@ pub(crate) enum StoreError {
     /// The disk, or the database.
     #[error("the control store: {0}")]
     Broken(String),
+    /// Another coordinator may lead.
+    #[error("not kept: {0}")]
+    Superseded(String),
 }
 
 impl From<TrustError> for StoreError {
@@ -112,6 +117,8 @@ pub(crate) struct Store {
     ///
     /// A lock, not an owner: sessions read side by side, each on a thread that may block. Held for a transaction.
     database: RwLock<Option<Database>>,
+    /// By what right it is written; `None`: nobody else can.
+    lead: Option<Arc<Lead>>,
 }
 
 impl Store {
@@ -122,9 +129,31 @@ impl Store {
         // The database asserts, deep inside, what its file's header says: on a file that was cut or changed it panics.
         let opened = catch_unwind(|| Self::open_database(directory, &path));
         let database = opened.unwrap_or_else(|panic| Err(fault(&path, &damage(panic.as_ref()))))?;
-        let store = Self { path, database: RwLock::new(Some(database)) };
+        let store = Self { path, database: RwLock::new(Some(database)), lead: None };
         store.begin(directory)?;
         Ok(store)
+    }
+
+    /// Puts a copy in the place of the database that a predecessor may have open: what it still writes reaches nobody. It
+    /// commits nothing that it says it did while this is done (`Lead::holds`).
+    pub(crate) fn copy_aside(directory: &Path) -> Result<(), StartError> {
+        let (path, copy) = (directory.join(FILE), directory.join(COPY));
+        let copied = || {
+            fs::copy(&path, &copy)?;
+            fs::File::open(&copy)?.sync_all()?;
+            fs::rename(&copy, &path)?;
+            fs::File::open(directory)?.sync_all()
+        };
+        copied().map_err(|error: io::Error| fault(&path, &error))
+    }
+
+    /// From now on it is written as long as `lead` holds.
+    pub(crate) fn led_by(self, lead: Arc<Lead>) -> Self {
+        Self { lead: Some(lead), ..self }
+    }
+
+    pub(crate) const fn lead(&self) -> Option<&Arc<Lead>> {
+        self.lead.as_ref()
     }
 
     /// Opens the database and reads it whole: damage shows at the start, not when somebody joins.
@@ -162,12 +191,20 @@ impl Store {
         &self,
         work: impl FnOnce(&WriteTransaction) -> Result<T, StoreError>,
     ) -> Result<T, StoreError> {
-        self.with(|database| {
+        self.check_lead()?;
+        let done = self.with(|database| {
             let transaction = database.begin_write().map_err(broken)?;
             let done = work(&transaction)?;
             transaction.commit().map_err(broken)?;
             Ok(done)
-        })
+        })?;
+        // Else a successor may have read before it was there.
+        self.check_lead()?;
+        Ok(done)
+    }
+
+    fn check_lead(&self) -> Result<(), StoreError> {
+        self.lead.as_ref().map_or(Ok(()), |lead| lead.holds()).map_err(StoreError::Superseded)
     }
 
     fn with<T>(&self, work: impl FnOnce(&Database) -> Result<T, StoreError>) -> Result<T, StoreError> {
@@ -514,7 +551,7 @@ fn damage(panic: &(dyn Any + Send)) -> String {
     format!("is damaged; restore it, or remove it if no worker runs ({text})")
 }
 
-fn fault(path: &Path, reason: &dyn ToString) -> StartError {
+pub(crate) fn fault(path: &Path, reason: &dyn ToString) -> StartError {
     StartError::State { path: path.to_owned(), reason: reason.to_string() }
 }
 

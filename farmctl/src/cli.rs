@@ -8,6 +8,7 @@ use clap::{
 };
 use farm_core::coordinator::policy::{FCFS, NEIGHBOURS};
 use mi_kernel::generate::RandomAlignment;
+use proto::control::coordinator_addresses;
 
 use crate::{failure::Failure, target::Target};
 
@@ -20,7 +21,7 @@ fn path_or_nothing() -> impl TypedValueParser<Value = PathBuf> {
 #[derive(Debug, Parser)]
 #[command(name = "farmctl", version, disable_version_flag = false)]
 pub(crate) struct Cli {
-    /// The farm's coordinator; without one, `render` and `mi` start a farm of their own, as `bench` always does.
+    /// The farm's coordinator, and with commas between its standbys; without one, `render` and `mi` start a farm of their own, as `bench` always does.
     #[arg(long, env = "GLEANER_COORDINATOR", value_name = "HOST:PORT", global = true)]
     pub coordinator: Option<String>,
     /// Who you are in a secured farm: what `init` or `join` has written; there, where it is written to
@@ -57,13 +58,11 @@ impl Cli {
         let Some(address) = self.coordinator.as_deref().filter(|address| !address.is_empty()) else {
             return Ok(None);
         };
-        match address.rsplit_once(':') {
-            Some((host, port)) if !host.is_empty() && !host.contains('/') && port.parse::<u16>().is_ok() => {
-                Ok(Some(address))
+        match coordinator_addresses(address) {
+            Ok(_) => Ok(Some(address)),
+            Err(error) => {
+                Err(Failure::Usage(anyhow::anyhow!("coordinator: {error}, such as 127.0.0.1:7700")))
             }
-            _ => Err(Failure::Usage(anyhow::anyhow!(
-                "coordinator {address:?} is not HOST:PORT, such as 127.0.0.1:7700"
-            ))),
         }
     }
 }

@@ -73,6 +73,10 @@ pub enum Signal {
     Int,
     /// Instant death.
     Kill,
+    /// It stands still.
+    Stop,
+    /// And goes on.
+    Continue,
 }
 
 impl Process {
@@ -170,6 +174,8 @@ impl Process {
             Signal::Term => "TERM",
             Signal::Int => "INT",
             Signal::Kill => "KILL",
+            Signal::Stop => "STOP",
+            Signal::Continue => "CONT",
         };
         let status = Command::new("sh")
             .args(["-c", &format!("kill -{name} {}", self.child.id())])

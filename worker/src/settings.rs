@@ -14,7 +14,10 @@ use clap::{
 };
 use farm_core::worker::Share;
 use gpu_exec::DeviceSpec;
-use proto::trust::{Identity, Role, default_identity};
+use proto::{
+    control::coordinator_addresses,
+    trust::{Identity, Role, default_identity},
+};
 use serde::Deserialize;
 use worker::{Isolation, WorkerOptions};
 
@@ -38,7 +41,7 @@ pub(crate) struct Arguments {
     /// Settings in TOML; the environment and flags overrule it.
     #[arg(long, value_name = "FILE", env = "GLEANER_CONFIG")]
     config: Option<PathBuf>,
-    /// The farm's coordinator.
+    /// The farm's coordinator; where it has standbys these, too, with commas between.
     #[arg(long, value_name = "HOST:PORT", env = "GLEANER_COORDINATOR")]
     coordinator: Option<String>,
     /// Address for applications (UDP); port 0 lets the system choose [default: 127.0.0.1:0].
@@ -146,7 +149,7 @@ pub(crate) fn options(arguments: Arguments) -> anyhow::Result<WorkerOptions> {
             "no coordinator: say --coordinator HOST:PORT, GLEANER_COORDINATOR, or `coordinator` in the config file"
         );
     };
-    check_host_port("coordinator", &coordinator)?;
+    coordinator_addresses(&coordinator).context("coordinator")?;
     let defaults = WorkerOptions::embedded(coordinator, Vec::new());
     let listen = address(arguments.listen.or(file.listen), defaults.listen)?;
     let insecure = arguments.insecure.or(file.insecure).unwrap_or(false);

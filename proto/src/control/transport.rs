@@ -4,10 +4,16 @@ use std::{error::Error, io, sync::Arc, time::Duration};
 
 use hyper_util::rt::TokioIo;
 use rustls::pki_types::ServerName;
+use tokio::task::JoinSet;
 use tokio_rustls::TlsConnector;
-use tonic::transport::{Channel, Endpoint, Server, Uri};
+use tonic::{
+    Code, Request, Status,
+    codegen::http::uri::PathAndQuery,
+    transport::{Channel, Endpoint, Server, Uri},
+};
+use tonic_prost::ProstCodec;
 
-use super::{SessionError, v1};
+use super::{SessionError, session::within_timeout, v1};
 use crate::net::TcpStream;
 
 /// How long connecting and each admin request may take.
@@ -27,6 +33,8 @@ const KEEP_ALIVE_TIMEOUT: Duration = Duration::from_secs(5);
 const STREAM_WINDOW_BYTES: u32 = 4 << 20;
 /// Unread bytes of one connection, at most.
 const CONNECTION_WINDOW_BYTES: u32 = 8 << 20;
+/// Most addresses of a farm's coordinators.
+const MAX_COORDINATORS: usize = 8;
 /// Sessions and requests of one connection at a time.
 const STREAMS_PER_CONNECTION: u32 = 64;
 
@@ -69,11 +77,70 @@ pub fn trust_server<T: v1::trust_server::Trust>(trust: T) -> v1::trust_server::T
         .max_encoding_message_size(MAX_MESSAGE_BYTES)
 }
 
-/// Connects to `HOST:PORT`, under TLS if a configuration is given.
+/// The addresses in a coordinator's `HOST:PORT[,HOST:PORT]...`: its own, and its standbys'.
+///
+/// # Errors
+/// [`SessionError::Address`] names the one that is none.
+pub fn coordinator_addresses(coordinator: &str) -> Result<Vec<&str>, SessionError> {
+    let addresses: Vec<&str> = coordinator.split(',').collect();
+    if addresses.len() > MAX_COORDINATORS {
+        let reason = format!("at most {MAX_COORDINATORS} coordinators may be named");
+        return Err(SessionError::Address { address: coordinator.to_owned(), reason });
+    }
+    addresses.iter().try_for_each(|address| endpoint(address).map(drop))?;
+    Ok(addresses)
+}
+
+/// Connects to the coordinator, under TLS if a configuration is given. Of several addresses to the first that answers: all are
+/// dialled side by side, and one that only takes connections, as a process that was stopped does, is not taken for alive.
 pub(super) async fn connect(
     coordinator: &str,
     tls: Option<rustls::ClientConfig>,
 ) -> Result<Channel, SessionError> {
+    let addresses = coordinator_addresses(coordinator)?;
+    if let [only] = addresses[..] {
+        return dial(only, tls).await;
+    }
+    let mut dials = JoinSet::new();
+    for address in addresses {
+        let (address, tls) = (address.to_owned(), tls.clone());
+        dials.spawn(async move {
+            let channel = dial(&address, tls).await?;
+            answers(&address, channel.clone()).await?;
+            Ok(channel)
+        });
+    }
+    let mut failures = Vec::new();
+    while let Some(dialled) = dials.join_next().await {
+        match dialled {
+            Ok(Ok(channel)) => return Ok(channel),
+            Ok(Err(SessionError::Unreachable { address, reason })) => {
+                failures.push(format!("{address}: {reason}"))
+            }
+            // Somebody is there, and does not let the caller in.
+            Ok(Err(error)) => return Err(error),
+            Err(error) => failures.push(error.to_string()),
+        }
+    }
+    Err(SessionError::Unreachable { address: coordinator.to_owned(), reason: failures.join("; ") })
+}
+
+/// Asks for a standard service that no coordinator has: whoever says so is there.
+async fn answers(address: &str, channel: Channel) -> Result<(), SessionError> {
+    let mut client = tonic::client::Grpc::new(channel);
+    let asked = async {
+        client.ready().await.map_err(|error| Status::unavailable(root_cause(&error)))?;
+        let path = PathAndQuery::from_static("/grpc.health.v1.Health/Check");
+        match client.unary::<(), (), _>(Request::new(()), path, ProstCodec::default()).await {
+            Err(status) if status.code() != Code::Unimplemented => Err(status),
+            Ok(_) | Err(_) => Ok(()),
+        }
+    };
+    within_timeout(address, asked).await
+}
+
+/// Connects to `HOST:PORT`.
+async fn dial(coordinator: &str, tls: Option<rustls::ClientConfig>) -> Result<Channel, SessionError> {
     let endpoint = endpoint(coordinator)?;
     let address: Arc<str> = coordinator.into();
     let connected = match tls {
