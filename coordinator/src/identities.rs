@@ -94,6 +94,7 @@ impl Identities {
         &mut self,
         link: LinkId,
         member: &Member,
+        project: &str,
         message: &CoordinatorToApp,
     ) -> Option<Vec<u8>> {
         let Gate::Members(security) = &self.gate else { return None };
@@ -108,7 +109,7 @@ impl Identities {
             }
             _ => return None,
         };
-        security.capability(given.app, given.incarnation, &member.principal, given.epoch)
+        security.capability(given.app, given.incarnation, &member.principal, project, given.epoch)
     }
 
     pub(crate) fn forget(&mut self, link: LinkId) {

@@ -14,7 +14,7 @@ use farm_core::{
     project::Quota,
     time::Instant,
 };
-use proto::trust::{Capability, Member};
+use proto::trust::{Capability, Member, Scope};
 use tokio::{
     sync::{mpsc, oneshot},
     time,
@@ -176,6 +176,7 @@ impl Owner {
                             let project = peer.project.clone();
                             self.machine.handle(now, Event::AppIntroduced { link, project });
                         }
+                        let message = in_scope(peer, message);
                         self.machine.handle(now, Event::FromApp { link, message });
                     }
                     Err(reason) => self.refuse(now, link, reason),
@@ -275,8 +276,10 @@ impl Owner {
             peer.refused = Some(reason.clone());
             self.identities.refused_by_quota(peer.member.as_ref(), reason);
         }
-        let capability =
-            peer.member.as_ref().and_then(|member| self.identities.capability(link, member, &message));
+        let capability = peer
+            .member
+            .as_ref()
+            .and_then(|member| self.identities.capability(link, member, &peer.project, &message));
         capability.is_none_or(|bytes| peer.tell(CoordinatorToApp::Capability(bytes))) && peer.tell(message)
     }
 
@@ -299,6 +302,14 @@ impl Owner {
         self.identities.forget(link);
         self.apps.remove(&link).is_some() || self.nodes.remove(&link).is_some()
     }
+}
+
+/// Names the contents of a member's jobs as nodes do.
+fn in_scope(peer: &Peer<CoordinatorToApp>, mut message: AppToCoordinator) -> AppToCoordinator {
+    if let (Some(_), AppToCoordinator::Plan(request)) = (&peer.member, &mut message) {
+        Scope::of(&peer.project).name_all(&mut request.contents);
+    }
+    message
 }
 
 /// Talks to the owner; cloneable.

@@ -202,10 +202,12 @@ impl Security {
         app: AppId,
         incarnation: AppIncarnation,
         holder: &Principal,
+        project: &str,
         epoch: Epoch,
     ) -> Option<Vec<u8>> {
         let expires = SystemTime::now() + CAPABILITY_LIFETIME;
-        let capability = Capability { app, incarnation, holder: holder.clone(), epoch, expires };
+        let (holder, project) = (holder.clone(), project.to_owned());
+        let capability = Capability { app, incarnation, holder, project, epoch, expires };
         match capability.sign(&self.identity) {
             Ok(bytes) => Some(bytes),
             Err(error) => {

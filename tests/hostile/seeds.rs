@@ -178,6 +178,7 @@ pub(crate) const SEEDS: &[Seed] = &[
             app: AppId(7),
             incarnation: AppIncarnation(2),
             holder: holder(),
+            project: "default".to_owned(),
             epoch: Epoch(3),
             expires: now() + Duration::from_secs(3_600),
         };

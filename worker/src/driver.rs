@@ -9,8 +9,11 @@ use std::{
 };
 
 use farm_core::{
-    id::{DeviceIndex, JobAttempt, LinkId, NodeId},
-    message::{AppToNode, CoordinatorToNode, JobFailure, LatencyClass, NodeToApp, NodeToCoordinator},
+    id::{ContentHash, DeviceIndex, JobAttempt, LinkId, NodeId},
+    message::{
+        AppToNode, CoordinatorToNode, JobFailure, JobTicket, LatencyClass, NodeToApp, NodeToCoordinator,
+        ResultHeader,
+    },
     program::Content,
     time,
     worker::{Effect, Event, Provider, WorkerConfig, WorkerMachine},
@@ -19,7 +22,7 @@ use proto::{
     codec,
     control::{SessionError, SessionSender},
     link::{DataServer, Frame, LinkSender},
-    trust::{Capability, Principal},
+    trust::{Capability, Principal, Scope},
 };
 use tokio::{
     sync::{mpsc, oneshot},
@@ -33,7 +36,7 @@ use crate::{
     device::{Device, DeviceEvent, DeviceNews},
     executor::{Executor, Order},
     link::{self, Outbox, Source},
-    programs::Programs,
+    programs::{Program, Programs},
     session::{self, NodeLink},
     spool::Spool,
 };
@@ -105,6 +108,8 @@ struct Driver {
     contents: Contents,
     programs: Programs,
     spool: Spool,
+    /// Names of contents that jobs may have come or gone with in this turn.
+    renamed: Vec<ContentHash>,
     /// Failures that the driver itself found, to be told to the machine in the next turn.
     found: Vec<Event>,
     registered: Option<oneshot::Sender<NodeId>>,
@@ -140,6 +145,7 @@ pub(crate) async fn drive(setup: Setup) -> End {
         devices: devices.into_iter().map(Device::new).collect(),
         programs: Programs::default(),
         spool,
+        renamed: Vec::new(),
         found: Vec::new(),
         registered: Some(registered),
         end: None,
@@ -315,22 +321,36 @@ impl Driver {
     ///
     /// # Errors
     /// It may not.
-    fn check_hello(&self, link: LinkId, frame: &Frame<AppToNode>) -> Result<(), String> {
+    fn check_hello(&mut self, link: LinkId, frame: &Frame<AppToNode>) -> Result<(), String> {
         let (Some(own), AppToNode::Hello { app, incarnation, .. }) = (&self.options.identity, &frame.header)
         else {
             return Ok(());
         };
-        let peer = self.links.get(&link).and_then(Outbox::peer).ok_or("nobody has shown who this is")?;
-        let shown = Capability::check(&frame.payload, own, peer, SystemTime::now())
+        let nobody = "nobody has shown who this is";
+        let outbox = self.links.get_mut(&link).ok_or(nobody)?;
+        let shown = Capability::check(&frame.payload, own, outbox.peer().ok_or(nobody)?, SystemTime::now())
             .map_err(|error| error.to_string())?;
-        if (shown.app, shown.incarnation) == (*app, *incarnation) {
-            Ok(())
-        } else {
-            Err(format!("the capability is for {}, {}", shown.app, shown.incarnation))
+        if (shown.app, shown.incarnation) != (*app, *incarnation) {
+            return Err(format!("the capability is for {}, {}", shown.app, shown.incarnation));
+        }
+        outbox.set_scope(Scope::of(&shown.project));
+        Ok(())
+    }
+
+    /// Names the contents of an application's jobs as those of its project.
+    fn name_contents(&mut self, scope: Scope, tickets: &mut [JobTicket]) {
+        if scope == Scope::OPEN {
+            return;
+        }
+        for content in tickets.iter_mut().flat_map(|ticket| &mut ticket.contents) {
+            let digest = content.hash;
+            content.hash = scope.name(digest);
+            self.contents.is_called(digest, content.hash);
+            self.renamed.push(content.hash);
         }
     }
 
-    fn app_said(&mut self, link: LinkId, frame: Frame<AppToNode>) {
+    fn app_said(&mut self, link: LinkId, mut frame: Frame<AppToNode>) {
         if let Err(reason) = self.check_hello(link, &frame) {
             tracing::warn!(%link, reason, "an application was refused");
             if let Some(outbox) = self.links.remove(&link) {
@@ -339,11 +359,13 @@ impl Driver {
             }
             return;
         }
-        if let AppToNode::Jobs(tickets) = &frame.header {
+        if let AppToNode::Jobs(tickets) = &mut frame.header {
+            let scope = self.links.get(&link).map_or(Scope::OPEN, Outbox::scope);
+            self.name_contents(scope, tickets);
             match codec::unpack_programs(frame.payload, tickets.len()) {
                 Ok(programs) => {
-                    for (ticket, program) in tickets.iter().zip(programs) {
-                        self.programs.keep(ticket.job, program);
+                    for (ticket, bytes) in tickets.iter().zip(programs) {
+                        self.programs.keep(ticket.job, Program { bytes, scope });
                     }
                 }
                 Err(error) => {
@@ -397,6 +419,11 @@ impl Driver {
             while let Some(effect) = self.machine.poll_effect() {
                 self.act(effect);
             }
+            for name in self.renamed.drain(..) {
+                if !self.machine.needs(&name) {
+                    self.contents.is_called_no_more(&name);
+                }
+            }
             if !self.found.is_empty() {
                 for event in std::mem::take(&mut self.found) {
                     self.tell(event);
@@ -415,7 +442,14 @@ impl Driver {
     fn act(&mut self, effect: Effect) {
         match effect {
             Effect::ToCoordinator(message) => self.send_to_coordinator(message),
-            Effect::ToApp { link, message } => {
+            Effect::ToApp { link, mut message } => {
+                if let NodeToApp::Result(ResultHeader {
+                    outcome: Err(JobFailure::ContentUnavailable(content)),
+                    ..
+                }) = &mut message
+                {
+                    *content = self.contents.digest_of(*content);
+                }
                 if let Some(outbox) = self.links.get(&link) {
                     outbox.send(message);
                 }
@@ -436,7 +470,10 @@ impl Driver {
                 self.programs.discard(job);
                 self.spool.discard(job);
             }
-            Effect::Release(hash) => self.contents.release(hash),
+            Effect::Release(content) => {
+                self.contents.release(content);
+                self.renamed.push(content);
+            }
             Effect::Evict(contents) => self.found.extend(self.contents.evict(&contents)),
             // After a refusal the machine exits too; the refusal is the reason.
             Effect::Exit => {

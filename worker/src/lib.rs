@@ -315,13 +315,14 @@ pub async fn start(options: WorkerOptions) -> Result<WorkerHandle, StartError> {
 /// Opens the caches; a large folder takes its time.
 async fn open_contents(options: &WorkerOptions) -> Result<Contents, StartError> {
     let (cap_bytes, disk_bytes) = (options.content_cache_bytes, options.disk_cache_bytes);
+    let open = options.identity.is_none();
     let Some(path) = options.cache.clone() else {
-        let memory_alone = Contents::open(cap_bytes, None);
+        let memory_alone = Contents::open(cap_bytes, None, open);
         return Ok(memory_alone?);
     };
     let opening = tokio::task::spawn_blocking(move || {
         check_cache(&path)
-            .and_then(|()| Contents::open(cap_bytes, Some((&path, disk_bytes))))
+            .and_then(|()| Contents::open(cap_bytes, Some((&path, disk_bytes)), open))
             .map_err(|source| StartError::Cache { path, source })
     });
     opening.await.map_err(std::io::Error::other)?

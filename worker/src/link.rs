@@ -7,7 +7,7 @@ use std::{
 };
 
 use farm_core::{
-    id::{JobAttempt, LinkId},
+    id::{ContentHash, JobAttempt, LinkId},
     message::{AppToNode, Contact, NodeToApp, ResultHeader},
     program::Content,
 };
@@ -15,7 +15,7 @@ use proto::{
     link::{
         Arrived, ContentBytes, ContentSource, DataServer, Frame, Link, LinkReceiver, LinkSender, TrySendError,
     },
-    trust::{Identity, Principal, Role},
+    trust::{Identity, Principal, Role, Scope},
 };
 use tokio::sync::mpsc;
 
@@ -58,11 +58,16 @@ pub(crate) enum Source {
 }
 
 impl Source {
-    /// Fetches what is missing of a content.
+    /// Fetches what is missing of a content, which nodes call `name`.
     ///
     /// # Errors
     /// It could not be had, for people; `arrived` holds what is right of it.
-    pub(crate) async fn fetch(self, content: Content, arrived: &mut Arrived) -> Result<ContentBytes, String> {
+    pub(crate) async fn fetch(
+        self,
+        name: ContentHash,
+        content: Content,
+        arrived: &mut Arrived,
+    ) -> Result<ContentBytes, String> {
         let fetched = match self {
             Self::Application(sender) => {
                 sender.ok_or("its application's link is over")?.fetch(content, arrived).await
@@ -73,7 +78,7 @@ impl Source {
                     proto::link::connect(&addresses, &certificate_der, identity.as_ref(), nothing)
                         .await
                         .map_err(|error| error.to_string())?;
-                link.sender.fetch(content, arrived).await
+                link.sender.fetch_named(name, content, arrived).await
             }
         };
         fetched.map_err(|error| error.to_string())
@@ -115,6 +120,8 @@ pub(crate) struct Outbox {
     sender: LinkSender<NodeToApp>,
     /// Who is at the other end, in a secured farm.
     peer: Option<Principal>,
+    /// Whose contents an application's jobs name.
+    scope: Scope,
     /// `Some` while frames wait. A lock, not messages: the forwarder must end and the owner must see that it ended in
     /// one step, or a frame could be left behind. Held for a push or a pop. At most one result of each job held
     /// waits here (`MAX_JOBS`).
@@ -131,12 +138,22 @@ impl Outbox {
         spool: Spool,
         inputs: mpsc::Sender<Input>,
     ) -> Self {
-        Self { sender, peer, backlog: Arc::new(Mutex::new(None)), spool, inputs }
+        Self { sender, peer, scope: Scope::OPEN, backlog: Arc::new(Mutex::new(None)), spool, inputs }
     }
 
     /// Who is at the other end, in a secured farm.
     pub(crate) const fn peer(&self) -> Option<&Principal> {
         self.peer.as_ref()
+    }
+
+    /// Whose contents the application's jobs name.
+    pub(crate) const fn scope(&self) -> Scope {
+        self.scope
+    }
+
+    /// The application has shown its project.
+    pub(crate) const fn set_scope(&mut self, scope: Scope) {
+        self.scope = scope;
     }
 
     /// The link, for fetching.

@@ -155,4 +155,18 @@ impl JobProgram {
     pub fn commands(&self) -> &[Command] {
         &self.commands
     }
+
+    /// The same program with other names for its contents.
+    #[must_use]
+    pub fn with_contents_named(mut self, name: impl Fn(ContentHash) -> ContentHash) -> Self {
+        for command in &mut self.commands {
+            if let Command::TaskAllocation { content, .. } | Command::Function { module: content, .. } =
+                command
+            {
+                content.hash = name(content.hash);
+            }
+        }
+        self.definitions = build::Definitions::default();
+        self
+    }
 }

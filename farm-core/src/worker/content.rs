@@ -88,6 +88,12 @@ impl WorkerMachine {
         })
     }
 
+    /// Whether a job that is here names this content.
+    #[must_use]
+    pub fn needs(&self, content: &ContentHash) -> bool {
+        self.contents.contains_key(content)
+    }
+
     /// Counts a new job's contents. Returns how many are not here.
     pub(super) fn hold_contents(
         &mut self,

@@ -2652,6 +2652,9 @@ pub struct CapabilityClaims {
     /// Until when it counts, in seconds since 1970.
     #[prost(uint64, tag = "5")]
     pub expires_s: u64,
+    /// The project that the application was of.
+    #[prost(string, tag = "6")]
+    pub project: ::prost::alloc::string::String,
 }
 /// Generated client implementations.
 pub mod trust_client {

@@ -79,6 +79,7 @@ impl Arrived {
 /// The asking side.
 pub(super) async fn fetch(
     shared: Arc<Shared>,
+    name: ContentHash,
     content: Content,
     arrived: &mut Arrived,
 ) -> Result<ContentBytes, FetchError> {
@@ -95,7 +96,7 @@ pub(super) async fn fetch(
     arrived.bytes.truncate(whole_pieces * PIECE_BYTES);
     let first = u32::try_from(whole_pieces).expect("the cap is some thousand pieces");
     let mut buffer = BytesMut::with_capacity(REQUEST_BYTES);
-    buffer.put_slice(&hash.0);
+    buffer.put_slice(&name.0);
     buffer.put_u64_le(content.size_bytes);
     buffer.put_u32_le(first);
     request.write_chunk(buffer.freeze()).await.map_err(lost)?;

@@ -128,7 +128,20 @@ impl<S> LinkSender<S> {
     /// # Errors
     /// Not found, wrong bytes, stalled, or the link is over.
     pub async fn fetch(&self, content: Content, arrived: &mut Arrived) -> Result<ContentBytes, FetchError> {
-        fetch::fetch(self.guard.shared(), content, arrived).await
+        self.fetch_named(content.hash, content, arrived).await
+    }
+
+    /// The same of a content that the other side has under another name than its digest.
+    ///
+    /// # Errors
+    /// As [`Self::fetch`].
+    pub async fn fetch_named(
+        &self,
+        name: ContentHash,
+        content: Content,
+        arrived: &mut Arrived,
+    ) -> Result<ContentBytes, FetchError> {
+        fetch::fetch(self.guard.shared(), name, content, arrived).await
     }
 
     /// The peer's address.

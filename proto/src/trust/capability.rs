@@ -27,6 +27,8 @@ pub struct Capability {
     pub incarnation: AppIncarnation,
     /// Whose it is: it counts on connections of this principal alone.
     pub holder: Principal,
+    /// The project that it was of; its contents are this project's.
+    pub project: String,
     /// The life of the coordinator that gave it.
     pub epoch: Epoch,
     /// Until when it counts.
@@ -43,6 +45,7 @@ impl Capability {
             app: self.app.0,
             incarnation: self.incarnation.0,
             holder: self.holder.to_string(),
+            project: self.project.clone(),
             epoch: self.epoch.0,
             expires_s: unix_seconds(self.expires),
         };
@@ -88,6 +91,7 @@ impl Capability {
             app: AppId(claims.app),
             incarnation: AppIncarnation(claims.incarnation),
             holder: claims.holder.parse()?,
+            project: claims.project,
             epoch: Epoch(claims.epoch),
             // A year that no clock reaches is not a reason to panic.
             expires: SystemTime::UNIX_EPOCH + Duration::from_secs(claims.expires_s.min(u64::from(u32::MAX))),
@@ -113,6 +117,7 @@ mod tests {
             app: AppId(7),
             incarnation: AppIncarnation(2),
             holder: holder.principal().clone(),
+            project: "studio".to_owned(),
             epoch: Epoch(3),
             expires: SystemTime::UNIX_EPOCH + Duration::from_secs(crate::trust::unix_now() + 60),
         }

@@ -8,6 +8,7 @@ mod authority;
 mod capability;
 mod identity;
 mod principal;
+mod scope;
 mod token;
 pub(crate) mod verify;
 
@@ -27,6 +28,7 @@ pub use self::{
     capability::{Capability, MAX_CAPABILITY_BYTES},
     identity::{Identity, Membership, NewKey, default_identity},
     principal::{Member, Principal, Role, check_name},
+    scope::Scope,
     token::{JoinToken, SECRET_BYTES},
 };
 

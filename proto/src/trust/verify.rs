@@ -186,6 +186,7 @@ mod tests {
             app: farm_core::id::AppId(1),
             incarnation: farm_core::id::AppIncarnation(1),
             holder: app.principal().clone(),
+            project: "default".to_owned(),
             epoch: farm_core::id::Epoch(1),
             expires: SystemTime::now() + Duration::from_secs(86_400),
         };

@@ -147,15 +147,15 @@ impl DiskCache {
 pub(super) struct Folder(PathBuf);
 
 impl Folder {
-    /// Reads a content and checks it. One that is not what its name says is removed.
+    /// Reads a content and checks it, where its digest is known. One that has another is removed.
     ///
     /// # Errors
     /// It is not there, or spoilt.
-    pub(super) fn read(&self, hash: &ContentHash) -> io::Result<ContentBytes> {
-        let path = self.path(hash);
+    pub(super) fn read(&self, name: &ContentHash, digest: Option<ContentHash>) -> io::Result<ContentBytes> {
+        let path = self.path(name);
         let bytes = ContentBytes::new(fs::read(&path)?);
-        if bytes.content().hash != *hash {
-            self.remove(hash);
+        if digest.is_some_and(|digest| bytes.content().hash != digest) {
+            self.remove(name);
             return Err(io::Error::new(io::ErrorKind::InvalidData, "the file is spoilt and was removed"));
         }
         // The order of use is for the next process, too; a disk that is read-only by now loses it.
@@ -240,7 +240,7 @@ mod tests {
         for hash in [first.hash, second.hash] {
             fs::File::open(cache.folder().path(&hash)).unwrap().set_modified(earlier).unwrap();
         }
-        assert_eq!(&cache.folder().read(&first.hash).unwrap()[..], b"first");
+        assert_eq!(&cache.folder().read(&first.hash, Some(first.hash)).unwrap()[..], b"first");
 
         let mut cache = DiskCache::open(folder.path(), 10).unwrap();
         assert_eq!(cache.figures(), (2, 10));
@@ -274,8 +274,8 @@ mod tests {
         store(&mut cache, b"first");
         let hash = content(b"first").hash;
         fs::write(cache.folder().path(&hash), b"fir\0t").unwrap();
-        assert_eq!(cache.folder().read(&hash).unwrap_err().kind(), io::ErrorKind::InvalidData);
-        assert_eq!(cache.folder().read(&hash).unwrap_err().kind(), io::ErrorKind::NotFound);
+        assert_eq!(cache.folder().read(&hash, Some(hash)).unwrap_err().kind(), io::ErrorKind::InvalidData);
+        assert_eq!(cache.folder().read(&hash, Some(hash)).unwrap_err().kind(), io::ErrorKind::NotFound);
     }
 
     #[test]

@@ -24,8 +24,8 @@ impl Shelf {
         self.bytes.read().unwrap_or_else(PoisonError::into_inner).get(hash).cloned()
     }
 
-    fn put(&self, bytes: ContentBytes) {
-        self.bytes.write().unwrap_or_else(PoisonError::into_inner).insert(bytes.content().hash, bytes);
+    fn put(&self, name: ContentHash, bytes: ContentBytes) {
+        self.bytes.write().unwrap_or_else(PoisonError::into_inner).insert(name, bytes);
     }
 
     fn take(&self, hash: &ContentHash) {
@@ -131,11 +131,12 @@ impl MemoryCache {
     /// Takes a content in, pinned; evicts idle ones for it, which `evicted` is told of.
     pub(super) fn insert(
         &mut self,
+        hash: ContentHash,
         bytes: ContentBytes,
         mut evicted: impl FnMut(ContentHash),
     ) -> Result<(), CacheFull> {
-        let Content { hash, size_bytes } = bytes.content();
-        if self.pin(bytes.content()) {
+        let size_bytes = bytes.content().size_bytes;
+        if self.pin(Content { hash, size_bytes }) {
             return Ok(());
         }
         while self.bytes + size_bytes > self.cap_bytes {
@@ -146,7 +147,7 @@ impl MemoryCache {
             evicted(oldest);
         }
         self.bytes += size_bytes;
-        self.shelf.put(bytes);
+        self.shelf.put(hash, bytes);
         self.entries.insert(hash, Entry { size_bytes, last_use: 0, pinned: true });
         Ok(())
     }
@@ -166,14 +167,14 @@ mod tests {
         let mut cache = MemoryCache::new(100);
         let [(a, a_bytes), (b, b_bytes), (c, c_bytes)] = [content(1, 40), content(2, 40), content(3, 40)];
         let mut evicted = Vec::new();
-        cache.insert(a_bytes, |hash| evicted.push(hash)).unwrap();
-        cache.insert(b_bytes, |hash| evicted.push(hash)).unwrap();
+        cache.insert(a, a_bytes, |hash| evicted.push(hash)).unwrap();
+        cache.insert(b, b_bytes, |hash| evicted.push(hash)).unwrap();
         cache.release(a);
         cache.release(b);
         assert!(!cache.pin(Content { hash: a, size_bytes: 39 }), "not of this size");
         assert!(cache.pin(Content { hash: a, size_bytes: 40 }), "a is here");
         cache.release(a);
-        cache.insert(c_bytes, |hash| evicted.push(hash)).unwrap();
+        cache.insert(c, c_bytes, |hash| evicted.push(hash)).unwrap();
         assert_eq!(evicted, [b], "whoever announces contents is told");
         assert!(cache.shelf().get(&b).is_none(), "b was used before a");
         assert!(cache.shelf().get(&a).is_some() && cache.shelf().get(&c).is_some(), "only one had to go");
@@ -182,13 +183,16 @@ mod tests {
     #[test]
     fn pinned_contents_stay_and_the_cap_holds() {
         let mut cache = MemoryCache::new(100);
-        let [(a, a_bytes), (_, b_bytes)] = [content(1, 60), content(2, 60)];
-        cache.insert(a_bytes.clone(), drop).unwrap();
-        cache.insert(a_bytes, drop).unwrap();
+        let [(a, a_bytes), (b, b_bytes)] = [content(1, 60), content(2, 60)];
+        cache.insert(a, a_bytes.clone(), drop).unwrap();
+        cache.insert(a, a_bytes, drop).unwrap();
         assert_eq!(cache.bytes, 60, "the same content is held once");
-        assert_eq!(cache.insert(b_bytes.clone(), drop), Err(CacheFull { pinned_bytes: 60, cap_bytes: 100 }));
+        assert_eq!(
+            cache.insert(b, b_bytes.clone(), drop),
+            Err(CacheFull { pinned_bytes: 60, cap_bytes: 100 })
+        );
         cache.release(a);
-        cache.insert(b_bytes, drop).unwrap();
+        cache.insert(b, b_bytes, drop).unwrap();
         assert!(cache.shelf().get(&a).is_none(), "the cap holds");
     }
 }

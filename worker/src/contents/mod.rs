@@ -30,6 +30,10 @@ const MAX_ARRIVED_BYTES: u64 = 4 << 30;
 /// What is kept, and what is on its way.
 #[derive(Debug)]
 pub(crate) struct Contents {
+    /// What the bytes of those contents have as their digest that jobs need and that are not called by it.
+    digests: HashMap<ContentHash, ContentHash>,
+    /// Whether names are digests.
+    open: bool,
     memory: MemoryCache,
     disk: Option<DiskCache>,
     /// Fetches on the way, and whether the machine still waits for them.
@@ -57,13 +61,15 @@ pub(crate) struct Fetched {
 }
 
 impl Contents {
-    /// Opens the cache folder, if there is one. Blocks.
+    /// Opens the cache folder, if there is one; in an open farm contents are called by their digests. Blocks.
     ///
     /// # Errors
     /// The folder cannot be used.
-    pub(crate) fn open(memory_cap_bytes: u64, disk: Option<(&Path, u64)>) -> io::Result<Self> {
+    pub(crate) fn open(memory_cap_bytes: u64, disk: Option<(&Path, u64)>, open: bool) -> io::Result<Self> {
         let disk = disk.map(|(folder, cap_bytes)| DiskCache::open(folder, cap_bytes)).transpose()?;
         Ok(Self {
+            digests: HashMap::new(),
+            open,
             memory: MemoryCache::new(memory_cap_bytes),
             disk,
             fetching: HashMap::new(),
@@ -83,10 +89,27 @@ impl Contents {
     pub(crate) fn source(&self) -> ContentSource {
         let shelf = self.shelf().clone();
         let source = ContentSource::new(move |hash| shelf.get(&hash));
+        let open = self.open;
         match self.disk.as_ref().map(DiskCache::folder) {
-            Some(folder) => source.or_stored(move |hash| folder.read(&hash).ok()),
+            // Who asks for it knows its digest in any case.
+            Some(folder) => source.or_stored(move |name| folder.read(&name, open.then_some(name)).ok()),
             None => source,
         }
+    }
+
+    /// Jobs call bytes with this digest by that name.
+    pub(crate) fn is_called(&mut self, digest: ContentHash, name: ContentHash) {
+        self.digests.insert(name, digest);
+    }
+
+    /// No job needs a content of this name any more.
+    pub(crate) fn is_called_no_more(&mut self, name: &ContentHash) {
+        self.digests.remove(name);
+    }
+
+    /// The digest of a content that jobs need.
+    pub(crate) fn digest_of(&self, name: ContentHash) -> ContentHash {
+        self.digests.get(&name).copied().unwrap_or(name)
     }
 
     /// What earlier processes left on disk.
@@ -109,15 +132,16 @@ impl Contents {
         }
         let disk = self.disk.as_ref().filter(|disk| disk.has(&content.hash)).map(DiskCache::folder);
         let mut arrived = self.arrived.remove(&content.hash).unwrap_or_default();
+        let wanted = Content { hash: self.digest_of(content.hash), ..content };
         tokio::spawn(async move {
             let stored = match &disk {
-                Some(folder) => read(folder.clone(), content).await,
+                Some(folder) => read(folder.clone(), content.hash, wanted).await,
                 None => None,
             };
             let (from_disk, disk_failed) = (stored.is_some(), disk.is_some() && stored.is_none());
             let result = match stored {
                 Some(bytes) => Ok(bytes),
-                None => from.fetch(content, &mut arrived).await,
+                None => from.fetch(content.hash, wanted, &mut arrived).await,
             };
             let fetched = Fetched { result, arrived, from_disk, disk_failed };
             // Without a driver the worker has ended.
@@ -150,7 +174,7 @@ impl Contents {
                     self.figures.fetched_bytes += content.size_bytes;
                 }
                 self.keep(content, bytes.bytes(), fetched.from_disk, inputs);
-                self.take_in(bytes, &mut events)
+                self.take_in(hash, bytes, &mut events)
             }
             Err(reason) => {
                 if wanted && fetched.arrived.size_bytes() + self.arrived_bytes() <= MAX_ARRIVED_BYTES {
@@ -226,10 +250,10 @@ impl Contents {
     }
 
     /// Puts bytes into memory, pinned; the reason, for people, if there is no room.
-    fn take_in(&mut self, bytes: ContentBytes, events: &mut Vec<Event>) -> Option<String> {
+    fn take_in(&mut self, name: ContentHash, bytes: ContentBytes, events: &mut Vec<Event>) -> Option<String> {
         let Self { memory, disk, figures, .. } = self;
         let mut gone = Vec::new();
-        let taken = memory.insert(bytes, |hash| gone.push(hash));
+        let taken = memory.insert(name, bytes, |hash| gone.push(hash));
         figures.memory_evictions += gone.len() as u64;
         gone.retain(|hash| disk.as_ref().is_none_or(|disk| !disk.has(hash)));
         events.extend(evicted(gone));
@@ -265,8 +289,8 @@ fn evicted(gone: Vec<ContentHash>) -> Vec<Event> {
 }
 
 /// Reads a content from disk; `None` if it is not what it should be.
-async fn read(folder: Folder, content: Content) -> Option<ContentBytes> {
-    let read = tokio::task::spawn_blocking(move || folder.read(&content.hash)).await.ok()?;
+async fn read(folder: Folder, name: ContentHash, content: Content) -> Option<ContentBytes> {
+    let read = tokio::task::spawn_blocking(move || folder.read(&name, Some(content.hash))).await.ok()?;
     match read {
         Ok(bytes) if bytes.len() as u64 == content.size_bytes => Some(bytes),
         // Its digest is right: the application is mistaken, and is told when it is asked.

@@ -288,8 +288,10 @@ mod tests {
         id::{AppId, Attempt, Epoch, JobId, JobIndex, TaskId},
         message::LatencyClass,
     };
+    use proto::trust::Scope;
 
     use super::*;
+    use crate::programs::Program;
 
     const LIMIT: Duration = Duration::from_secs(10);
 
@@ -302,7 +304,8 @@ mod tests {
     fn sent(now: Instant, jobs: u32) -> Book {
         let mut book = Book::new(now);
         for index in 0..jobs {
-            let (class, program) = (LatencyClass::Batch, Bytes::new());
+            let class = LatencyClass::Batch;
+            let program = Program { bytes: Bytes::new(), scope: Scope::OPEN };
             book.take(Order { job: job(index), class, program, limit: LIMIT });
         }
         for index in 0..jobs {

@@ -9,10 +9,9 @@ use farm_core::{
     program::{Command, JobProgram},
 };
 use gpu_exec::{Busy, DeviceSpec, ExecutorConfig, ExecutorEvent, OpenError};
-use proto::codec;
 use tokio::sync::mpsc;
 
-use super::Order;
+use super::{Order, decode};
 use crate::{
     contents::Shelf,
     device::{DeviceEvent, DeviceNews},
@@ -49,7 +48,7 @@ impl InProcess {
 
     pub(super) fn submit(&self, order: Order) -> Result<(), Busy> {
         let Order { job, class, program, limit } = order;
-        match codec::decode_program(&program) {
+        match decode(&program.bytes, program.scope) {
             Ok(program) => {
                 let contents = named_contents(&program)
                     .into_iter()

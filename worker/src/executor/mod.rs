@@ -16,20 +16,24 @@ use std::{
     time::Duration,
 };
 
-use bytes::Bytes;
 use farm_core::{
     device::DeviceInfo,
     id::{DeviceIndex, JobAttempt},
     message::LatencyClass,
+    program::JobProgram,
 };
 use gpu_exec::{Busy, DeviceSpec, OpenError};
+use proto::{
+    codec::{self, CodecError},
+    trust::Scope,
+};
 use tokio::sync::mpsc;
 
 use self::{
     apart::{ExecutorProcess, Launch},
     here::InProcess,
 };
-use crate::{StartError, contents::Shelf, device::DeviceEvent};
+use crate::{StartError, contents::Shelf, device::DeviceEvent, programs::Program};
 
 /// First argument of a binary that is to be an executor process; the second is its device, the third, if there is one, the folder
 /// for what drivers compile.
@@ -67,10 +71,17 @@ pub fn serve_if_executor(mut arguments: impl Iterator<Item = OsString>) -> Optio
 pub(crate) struct Order {
     pub(crate) job: JobAttempt,
     pub(crate) class: LatencyClass,
-    /// Encoded, as it came.
-    pub(crate) program: Bytes,
+    pub(crate) program: Program,
     /// How long it may run, interruptions not counted.
     pub(crate) limit: Duration,
+}
+
+/// A program as the device gets it: with its contents by the names that the node's cache has for them.
+///
+/// # Errors
+/// The bytes are no program.
+fn decode(program: &[u8], scope: Scope) -> Result<JobProgram, CodecError> {
+    Ok(codec::decode_program(program)?.with_contents_named(|digest| scope.name(digest)))
 }
 
 /// What carries a device's orders out. Dropping it ends what it holds.

@@ -115,9 +115,9 @@ impl Process {
 
     pub(super) fn execute(&self, order: &Order) {
         let Order { job, class, program, limit } = order;
-        let program_bytes = program.len() as u64;
-        let header = ToExecutor::Execute { job: *job, class: *class, limit: *limit, program_bytes };
-        self.send(&header, Some(program.clone()));
+        let (scope, program_bytes) = (program.scope, program.bytes.len() as u64);
+        let header = ToExecutor::Execute { job: *job, class: *class, limit: *limit, scope, program_bytes };
+        self.send(&header, Some(program.bytes.clone()));
     }
 
     /// Puts a message on its way. A process that is gone says so by itself.

@@ -22,9 +22,9 @@ use farm_core::{
     message::JobFailure,
 };
 use gpu_exec::{Busy, DeviceSpec, Executor, ExecutorConfig, ExecutorEvent, Host, HungDevice, Order};
-use proto::codec;
 
 use super::{
+    decode,
     mouth::Mouth,
     wire::{self, FromExecutor, Header as _, LENGTH_BYTES, ToExecutor},
 };
@@ -81,8 +81,8 @@ fn run(spec: &str, compiled: Option<PathBuf>, line: &Arc<Line>) -> io::Result<()
 
 fn take(executor: &Executor, line: &Line, header: ToExecutor, payload: Bytes) -> io::Result<()> {
     match header {
-        ToExecutor::Execute { job, class, limit, .. } => {
-            let failure = match codec::decode_program(&payload) {
+        ToExecutor::Execute { job, class, limit, scope, .. } => {
+            let failure = match decode(&payload, scope) {
                 Ok(program) => {
                     let order = Order { job, class, program: Arc::new(program), contents: Vec::new(), limit };
                     match executor.submit(order) {

@@ -12,7 +12,7 @@ use farm_core::{
     message::{JobFailure, LatencyClass},
     program::ProgramQuota,
 };
-use proto::codec::MAX_PROGRAM_BYTES;
+use proto::{codec::MAX_PROGRAM_BYTES, trust::Scope};
 use serde::{Deserialize, Serialize, de::DeserializeOwned};
 
 /// Bytes of the length field.
@@ -32,7 +32,7 @@ pub(super) trait Header: Serialize + DeserializeOwned {
 #[derive(Debug, Serialize, Deserialize)]
 pub(super) enum ToExecutor {
     /// Run this job; the payload is its encoded program.
-    Execute { job: JobAttempt, class: LatencyClass, limit: Duration, program_bytes: u64 },
+    Execute { job: JobAttempt, class: LatencyClass, limit: Duration, scope: Scope, program_bytes: u64 },
     /// Take it back.
     Abort(JobAttempt),
     /// The answer to [`FromExecutor::Wants`]; the payload is the content, `None` if it is not here.
