@@ -210,6 +210,7 @@ fn connect_error(options: &FarmOptions, error: SessionError) -> FarmError {
         error @ (SessionError::Ended { .. }
         | SessionError::Malformed { .. }
         | SessionError::Failed { .. }
+        | SessionError::UnknownRequest
         | SessionError::Full) => FarmError::Unreachable { address, reason: error.to_string() },
     }
 }

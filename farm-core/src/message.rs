@@ -1,7 +1,7 @@
 //! What the tiers say to each other, as domain data. Wire formats are `proto`'s; payload bytes (programs, results,
 //! allocations) never enter a machine: messages carry their names and sizes only.
 
-use std::time::Duration;
+use std::{cmp::Ordering, time::Duration};
 
 use serde::{Deserialize, Serialize};
 
@@ -19,6 +19,22 @@ use crate::{
 
 /// The protocol this build speaks. A peer of another version is refused at hello.
 pub const PROTOCOL_VERSION: u32 = 6;
+
+/// Whether a peer that says this version in its hello is spoken to.
+///
+/// # Errors
+/// It is of another version: both, and which side to upgrade, for the people at the peer.
+pub fn check_protocol(protocol: u32) -> Result<(), String> {
+    let older = match protocol.cmp(&PROTOCOL_VERSION) {
+        Ordering::Equal => return Ok(()),
+        Ordering::Less => "refused",
+        Ordering::Greater => "refusing",
+    };
+    Err(format!(
+        "protocol version {protocol} is not spoken here, version {PROTOCOL_VERSION} is: the {older} side is the older one, \
+         upgrade it"
+    ))
+}
 
 /// Estimated work of a job: nanoseconds on a device of speed 1.0. Zero means unknown.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]

@@ -144,6 +144,7 @@ pub(crate) fn failure(error: SessionError) -> Failure {
         | SessionError::Malformed { .. }
         | SessionError::Refused { .. }
         | SessionError::Failed { .. }
+        | SessionError::UnknownRequest
         | SessionError::Full => Failure::Work(error.into()),
     }
 }

@@ -255,10 +255,7 @@ impl Driver {
                 let events = self.contents.fetched(content, fetched, &self.inputs);
                 events.into_iter().for_each(|event| self.tell(event));
             }
-            Input::Stored { content, result } => {
-                let events = self.contents.stored(content, result);
-                events.into_iter().for_each(|event| self.tell(event));
-            }
+            Input::Stored { content, result } => self.contents.stored(content, result),
             // What it means is asked for after each turn.
             Input::SpoolChanged => {}
             Input::ResultLost { job } => self.tell(Event::ResultLost(job)),

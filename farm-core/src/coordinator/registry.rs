@@ -11,7 +11,7 @@ use super::{
 use crate::{
     device::DeviceInfo,
     id::{AppId, AppIncarnation, DeviceIndex, LinkId, NodeId},
-    message::{AppHello, CoordinatorToApp, CoordinatorToNode, NodeHello, PROTOCOL_VERSION},
+    message::{AppHello, CoordinatorToApp, CoordinatorToNode, NodeHello, check_protocol},
     time::Instant,
 };
 
@@ -340,13 +340,6 @@ enum Admission {
     Back(AppId),
     /// Nothing is known of it here.
     New(AppId, AppIncarnation),
-}
-
-fn check_protocol(protocol: u32) -> Result<(), String> {
-    if protocol == PROTOCOL_VERSION {
-        return Ok(());
-    }
-    Err(format!("protocol version {protocol} is not spoken here, version {PROTOCOL_VERSION} is"))
 }
 
 fn check_name(name: &str) -> Result<(), String> {

@@ -8,7 +8,7 @@ use std::{
 use super::{Effect, WorkerMachine};
 use crate::{
     id::{AppId, AppIncarnation, JobAttempt, LinkId},
-    message::{AppToNode, JobTicket, NodeToApp, PROTOCOL_VERSION},
+    message::{AppToNode, JobTicket, NodeToApp, check_protocol},
     project::AppTerms,
     time::Instant,
 };
@@ -265,11 +265,7 @@ impl WorkerMachine {
         id: AppId,
         incarnation: AppIncarnation,
     ) -> Result<(), String> {
-        if protocol != PROTOCOL_VERSION {
-            return Err(format!(
-                "protocol version {protocol} is not spoken here, version {PROTOCOL_VERSION} is"
-            ));
-        }
+        check_protocol(protocol)?;
         if self.node.is_none() {
             return Err("this node is not registered yet".to_owned());
         }

@@ -15,7 +15,7 @@ use farm_core::{
     message::{JobFailure, LatencyClass},
     program::{Content, JobProgram},
 };
-use gpu_exec::{DeviceSpec, Executor, ExecutorConfig, ExecutorEvent, Order, expand};
+use gpu_exec::{DeviceSpec, Executor, ExecutorConfig, ExecutorEvent, Host, Order, expand};
 
 /// Far more than any test needs; it only turns a hang into a failure.
 const PATIENCE: Duration = Duration::from_secs(120);
@@ -38,10 +38,18 @@ impl TestDevice {
     }
 
     pub(crate) fn with(config: ExecutorConfig) -> Self {
+        Self::hosted(config, |events| move |event| drop(events.send(event)))
+    }
+
+    /// With a host of the test's own, which passes the events on.
+    pub(crate) fn hosted<H: Host>(
+        config: ExecutorConfig,
+        host: impl FnOnce(mpsc::Sender<ExecutorEvent>) -> H,
+    ) -> Self {
         let specs = expand(&[DeviceSpec::All]).unwrap_or_else(|error| panic!("{error}"));
         let (sender, events) = mpsc::channel();
-        let executor = Executor::start(&specs[0], config, move |event| drop(sender.send(event)))
-            .unwrap_or_else(|error| panic!("{error}"));
+        let executor =
+            Executor::start(&specs[0], config, host(sender)).unwrap_or_else(|error| panic!("{error}"));
         Self { executor, events, next_job: AtomicU64::new(1) }
     }
 

@@ -1,12 +1,22 @@
 //! Device memory: zero-filled, cached, bounded.
 
+use std::{
+    collections::HashMap,
+    sync::{
+        Arc,
+        atomic::{AtomicBool, AtomicUsize, Ordering},
+        mpsc,
+    },
+};
+
 use bytes::Bytes;
 use farm_core::{
     id::ContentHash,
     message::JobFailure,
     program::{Content, JobProgram},
 };
-use gpu_exec::ExecutorConfig;
+use gpu_exec::{ExecutorConfig, ExecutorEvent, Host};
+use rand::{Rng as _, SeedableRng as _, rngs::SmallRng};
 
 use crate::device::{TestDevice, as_u32, content};
 
@@ -94,4 +104,94 @@ fn more_memory_than_the_device_has_is_refused() {
     let text = device.invalid(program, &[]);
     assert!(text.contains("command"), "{text}");
     assert_eq!(device.run_program(JobProgram::default(), &[]), Ok(Vec::new()));
+}
+
+/// Gives the allocations that are not on the device, and counts them.
+struct Shelf {
+    events: mpsc::Sender<ExecutorEvent>,
+    allocations: HashMap<ContentHash, Bytes>,
+    given: Arc<AtomicUsize>,
+    closed: Arc<AtomicBool>,
+}
+
+impl Host for Shelf {
+    fn event(&self, event: ExecutorEvent) {
+        // The test may be over.
+        let _ = self.events.send(event);
+    }
+
+    fn content(&self, hash: &ContentHash) -> Option<Bytes> {
+        if self.closed.load(Ordering::Relaxed) {
+            return None;
+        }
+        self.given.fetch_add(1, Ordering::Relaxed);
+        self.allocations.get(hash).cloned()
+    }
+}
+
+/// Scenario 29 on the device: three applications' allocations are twice what the cache may hold, jobs name one each, the popular
+/// ones more often; one job runs while the next is staged. Hits are those of a textbook LRU of the same size.
+#[test]
+#[expect(clippy::cast_possible_truncation, reason = "numbers and ranks of 72 allocations")]
+fn s29_the_device_hits_as_often_as_an_lru() {
+    const APPS: usize = 3;
+    const ALLOCATIONS: usize = 24;
+    const JOBS: usize = 600;
+    let mut rng = SmallRng::seed_from_u64(1);
+    let contents: Vec<(Content, (ContentHash, Bytes))> = (0..APPS * ALLOCATIONS)
+        .map(|number| content(bytemuck::cast_slice(&vec![number as u32; rng.random_range(1_024..8_192)])))
+        .collect();
+    let cap_bytes = contents.iter().map(|(content, _)| content.size_bytes).sum::<u64>() / 2;
+    let (_, module) = content(SUM.as_bytes());
+
+    let memory_bytes = TestDevice::open().executor.info().limits.memory_bytes;
+    // A byte more, lest the product be rounded below it.
+    let allocation_cache_fraction = (cap_bytes + 1) as f64 / memory_bytes as f64;
+    let config = ExecutorConfig { allocation_cache_fraction, ..ExecutorConfig::default() };
+    let (given, closed) = (Arc::<AtomicUsize>::default(), Arc::<AtomicBool>::default());
+    let device = TestDevice::hosted(config, |events| Shelf {
+        events,
+        allocations: contents.iter().map(|(_, named)| named.clone()).collect(),
+        given: Arc::clone(&given),
+        closed: Arc::clone(&closed),
+    });
+
+    let mut oldest_first: Vec<Content> = Vec::new();
+    let mut oracle_hits = 0;
+    let mut before = None;
+    for _ in 0..JOBS {
+        // As likely as 1 / rank: Zipf's law.
+        let rank = (ALLOCATIONS as f64 + 1.0).powf(rng.random()) as usize - 1;
+        let number = rng.random_range(0..APPS) * ALLOCATIONS + rank;
+        let allocation = contents[number].0;
+        let order = device.order(first_of(allocation), std::slice::from_ref(&module));
+        let staged = (order.job, number);
+        device.executor.submit(order).unwrap();
+        if let Some((job, number)) = before.replace(staged) {
+            assert_eq!(as_u32(&device.finished(job).1.unwrap()[0]), [number as u32]);
+        }
+        let place = oldest_first.iter().position(|used| *used == allocation);
+        oracle_hits += usize::from(place.map(|place| oldest_first.remove(place)).is_some());
+        oldest_first.push(allocation);
+        while oldest_first.iter().map(|used| used.size_bytes).sum::<u64>() > cap_bytes {
+            oldest_first.remove(0);
+        }
+    }
+    device.finished(before.unwrap().0).1.unwrap();
+
+    let hits = JOBS - given.load(Ordering::Relaxed);
+    let [rate, oracle] = [hits, oracle_hits].map(|hits| hits as f64 / JOBS as f64);
+    println!("s29  device: hit rate {:.2} %, LRU {:.2} %", 100.0 * rate, 100.0 * oracle);
+    assert!(rate >= oracle - 0.01, "s29: {rate:.4}, LRU {oracle:.4}");
+    // What is served without the host is what is there.
+    closed.store(true, Ordering::Relaxed);
+    let here = |content: &Content| device.run_program(first_of(*content), &[]).is_ok();
+    let bytes: u64 = contents
+        .iter()
+        .map(|(content, _)| content)
+        .filter(|content| here(content))
+        .map(|content| content.size_bytes)
+        .sum();
+    println!("s29  device: {bytes} B on the device, cap {cap_bytes} B");
+    assert!(bytes <= cap_bytes && bytes > cap_bytes / 2, "{bytes} B, cap {cap_bytes} B");
 }

@@ -67,6 +67,9 @@ pub enum SessionError {
         /// Why.
         reason: String,
     },
+    /// The request came later than the coordinator. Not to be retried.
+    #[error("the coordinator does not know this request: it is of an earlier version, upgrade it")]
+    UnknownRequest,
     /// The farm does not let this caller in, or is not the caller's. Not to be retried.
     #[error("denied: {reason}")]
     Denied {
@@ -322,6 +325,7 @@ pub(super) async fn within_timeout<T>(
         {
             Err(SessionError::Refused { reason: status.message().to_owned() })
         }
+        Ok(Err(status)) if status.code() == Code::Unimplemented => Err(SessionError::UnknownRequest),
         Ok(Err(status)) if status.code() == Code::Internal => {
             Err(SessionError::Failed { reason: status.message().to_owned() })
         }
@@ -336,5 +340,18 @@ fn words(status: &Status) -> String {
     match status.message() {
         "" => transport::root_cause(status),
         message => message.to_owned(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Scenario 33: operators are not told that nobody answers there.
+    #[tokio::test]
+    async fn a_request_that_came_later_than_the_coordinator_is_not_taken_for_silence() {
+        let unknown = async { Err::<(), _>(Status::unimplemented("")) };
+        let error = within_timeout("127.0.0.1:1", unknown).await;
+        assert!(matches!(error, Err(SessionError::UnknownRequest)), "{error:?}");
     }
 }

@@ -1,5 +1,5 @@
 //! Peers of another version: scenario 33. Of bytes that are no message at all `proto/tests/conversions.rs` has the tests, of real
-//! sessions `coordinator/tests/farm.rs`.
+//! sessions `coordinator/tests/farm.rs`, of binaries of earlier commits `tests/upgrade.sh`.
 
 use farm_core::{
     coordinator::{CoordinatorConfig, CoordinatorMachine, Effect, Event},
@@ -29,11 +29,15 @@ fn contact() -> Contact {
     Contact { addresses: vec!["worker-0".to_owned()], certificate_der: Vec::new() }
 }
 
+/// Whether the reason names both versions, and the side to upgrade.
 fn refuses(reason: &str, protocol: u32) -> bool {
-    reason.contains(&protocol.to_string()) && reason.contains("version")
+    let older = if protocol < PROTOCOL_VERSION { "the refused side" } else { "the refusing side" };
+    [&format!("version {protocol} "), &format!("version {PROTOCOL_VERSION} "), older]
+        .iter()
+        .all(|words| reason.contains(*words))
 }
 
-/// Whether a coordinator refuses a node and an application of this version, naming it, and keeps nothing of them.
+/// Whether a coordinator refuses a node and an application of this version, saying why, and keeps nothing of them.
 fn coordinator_refuses(protocol: u32) -> bool {
     let mut machine = CoordinatorMachine::new(CoordinatorConfig::new(Epoch(1), 1));
     let node = NodeHello {
@@ -71,7 +75,7 @@ fn coordinator_refuses(protocol: u32) -> bool {
     (refused, closed) == (2, 2) && status.nodes.is_empty() && status.apps.is_empty()
 }
 
-/// Whether a registered node refuses an application of this version, naming it, and keeps nothing of it.
+/// Whether a registered node refuses an application of this version, saying why, and keeps nothing of it.
 fn node_refuses(protocol: u32) -> bool {
     let mut machine = WorkerMachine::new(WorkerConfig {
         name: "node".to_owned(),

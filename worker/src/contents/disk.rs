@@ -15,6 +15,8 @@ use std::{
 use farm_core::{id::ContentHash, program::Content};
 use proto::link::ContentBytes;
 
+/// Most bytes on their way to disk: memory beyond the cache's cap. What comes faster than the disk writes is not kept there.
+const MAX_WRITING_BYTES: u64 = 4 << 30;
 /// Most files; the oldest go first beyond it.
 const MAX_FILES: usize = 65_536;
 /// An unfinished file this old was left behind by a process that is gone.
@@ -31,6 +33,8 @@ pub(super) struct DiskCache {
     /// By last use.
     oldest: BTreeMap<u64, ContentHash>,
     bytes: u64,
+    /// On their way here: memory beyond the other cache's cap.
+    writing_bytes: u64,
     uses: u64,
 }
 
@@ -66,7 +70,7 @@ impl DiskCache {
         }
         found.sort_unstable_by_key(|(changed, content)| (*changed, content.hash));
         let (entries, oldest) = (HashMap::new(), BTreeMap::new());
-        let mut cache = Self { folder, cap_bytes, entries, oldest, bytes: 0, uses: 0 };
+        let mut cache = Self { folder, cap_bytes, entries, oldest, bytes: 0, writing_bytes: 0, uses: 0 };
         found.into_iter().for_each(|(_, content)| cache.book(content));
         cache.make_room(0).iter().for_each(|hash| cache.folder.remove(hash));
         Ok(cache)
@@ -91,9 +95,17 @@ impl DiskCache {
         self.entries.contains_key(hash)
     }
 
-    /// Whether a content would be kept.
-    pub(super) fn wants(&self, content: &Content) -> bool {
-        content.size_bytes <= self.cap_bytes && !self.has(&content.hash)
+    /// Makes room for a content that is to be written, so that the cap holds while it is. Gives what has to go; the files are
+    /// the caller's to remove, before it writes. `None` if it is not to be kept: it is here, is too large, or more comes than
+    /// the disk writes.
+    pub(super) fn make_way(&mut self, content: &Content) -> Option<Vec<ContentHash>> {
+        let writing_bytes = self.writing_bytes + content.size_bytes;
+        if self.has(&content.hash) || writing_bytes > self.cap_bytes.min(MAX_WRITING_BYTES) {
+            return None;
+        }
+        let gone = self.make_room(content.size_bytes);
+        self.writing_bytes = writing_bytes;
+        Some(gone)
     }
 
     /// It is used: others go before it.
@@ -106,14 +118,19 @@ impl DiskCache {
         }
     }
 
-    /// It has been written. Gives what has to go for it; the files are the caller's to remove.
-    pub(super) fn written(&mut self, content: Content) -> Vec<ContentHash> {
-        if self.has(&content.hash) {
-            return Vec::new();
+    /// It has been written, or could not be.
+    pub(super) fn written(&mut self, content: Content, whole: bool) {
+        self.writing_bytes -= content.size_bytes;
+        // Two applications may have brought it.
+        if whole && !self.has(&content.hash) {
+            self.book(content);
         }
-        let gone = self.make_room(content.size_bytes);
-        self.book(content);
-        gone
+    }
+
+    /// Bytes on their way here.
+    #[cfg(test)]
+    pub(super) fn writing_bytes(&self) -> u64 {
+        self.writing_bytes
     }
 
     /// It is to go, or was found spoilt; true if it was here.
@@ -133,7 +150,8 @@ impl DiskCache {
 
     fn make_room(&mut self, size_bytes: u64) -> Vec<ContentHash> {
         let mut gone = Vec::new();
-        while self.bytes + size_bytes > self.cap_bytes || self.entries.len() >= MAX_FILES {
+        while self.bytes + self.writing_bytes + size_bytes > self.cap_bytes || self.entries.len() >= MAX_FILES
+        {
             let Some((_, hash)) = self.oldest.first_key_value().map(|(at, hash)| (*at, *hash)) else { break };
             self.forget(&hash);
             gone.push(hash);
@@ -221,10 +239,10 @@ mod tests {
 
     fn store(cache: &mut DiskCache, bytes: &[u8]) -> Vec<ContentHash> {
         let content = content(bytes);
-        assert!(cache.wants(&content), "it is new and fits");
-        cache.folder().write(&content.hash, bytes).unwrap();
-        let gone = cache.written(content);
+        let gone = cache.make_way(&content).expect("it is new and fits");
         gone.iter().for_each(|hash| cache.folder().remove(hash));
+        cache.folder().write(&content.hash, bytes).unwrap();
+        cache.written(content, true);
         gone
     }
 
@@ -263,8 +281,21 @@ mod tests {
         store(&mut cache, b"secnd");
         cache.touch(&content(b"first").hash);
         assert_eq!(store(&mut cache, b"third"), [content(b"secnd").hash]);
-        assert!(!cache.wants(&content(b"eleven byte")), "over the cap");
-        assert!(!cache.wants(&content(b"third")), "here");
+        assert_eq!(cache.make_way(&content(b"eleven byte")), None, "over the cap");
+        assert_eq!(cache.make_way(&content(b"third")), None, "here");
+    }
+
+    #[test]
+    fn what_is_being_written_counts() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut cache = DiskCache::open(folder.path(), 10).unwrap();
+        store(&mut cache, b"first");
+        assert_eq!(cache.make_way(&content(b"secnd")), Some(Vec::new()));
+        assert_eq!(cache.make_way(&content(b"third")), Some(vec![content(b"first").hash]), "room for two");
+        assert_eq!(cache.make_way(&content(b"fourth")), None, "both are on their way");
+        cache.written(content(b"secnd"), false);
+        cache.written(content(b"third"), true);
+        assert_eq!(cache.figures(), (1, 5), "the disk did not take the other");
     }
 
     #[test]

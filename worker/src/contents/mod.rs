@@ -3,6 +3,8 @@
 
 mod disk;
 mod memory;
+#[cfg(test)]
+mod tests;
 
 use std::{
     collections::{BTreeSet, HashMap},
@@ -22,8 +24,6 @@ use self::{
 };
 use crate::{driver::Input, link::Source};
 
-/// Most bytes on their way to disk: memory beyond the cache's cap. What comes faster than the disk writes is not kept there.
-const MAX_WRITING_BYTES: u64 = 4 << 30;
 /// Most bytes that broken off fetches leave in memory; those of a further one come again from the start.
 const MAX_ARRIVED_BYTES: u64 = 4 << 30;
 
@@ -40,8 +40,6 @@ pub(crate) struct Contents {
     fetching: HashMap<ContentHash, bool>,
     /// What fetches that broke off left of contents that jobs still need: the next one goes on from there.
     arrived: HashMap<ContentHash, Arrived>,
-    /// Bytes on their way to disk.
-    writing_bytes: u64,
     figures: CacheFigures,
     /// What the machine was told last.
     told: CacheFigures,
@@ -74,7 +72,6 @@ impl Contents {
             disk,
             fetching: HashMap::new(),
             arrived: HashMap::new(),
-            writing_bytes: 0,
             figures: CacheFigures::default(),
             told: CacheFigures::default(),
         })
@@ -173,7 +170,8 @@ impl Contents {
                     self.figures.fetches += 1;
                     self.figures.fetched_bytes += content.size_bytes;
                 }
-                self.keep(content, bytes.bytes(), fetched.from_disk, inputs);
+                let gone = self.keep(content, bytes.bytes(), fetched.from_disk, inputs);
+                events.extend(evicted(gone.into_iter().filter(|hash| !self.memory.has(hash)).collect()));
                 self.take_in(hash, bytes, &mut events)
             }
             Err(reason) => {
@@ -200,18 +198,13 @@ impl Contents {
         }
     }
 
-    /// A content has been written to disk, or could not be: what the machine has to hear of what went for it.
-    pub(crate) fn stored(&mut self, content: Content, result: io::Result<()>) -> Vec<Event> {
-        let Some(disk) = &mut self.disk else { return Vec::new() };
-        self.writing_bytes -= content.size_bytes;
+    /// A content has been written to disk, or could not be.
+    pub(crate) fn stored(&mut self, content: Content, result: io::Result<()>) {
+        let Some(disk) = &mut self.disk else { return };
+        disk.written(content, result.is_ok());
         if let Err(error) = result {
             tracing::warn!(content = %content.hash, %error, "a content cannot be kept on disk");
-            return Vec::new();
         }
-        let gone = disk.written(content);
-        self.figures.disk_evictions += gone.len() as u64;
-        remove(disk.folder(), gone.clone());
-        evicted(gone.into_iter().filter(|hash| !self.memory.has(hash)).collect())
     }
 
     /// Drops contents that no job needs, all such if none is named: what the machine has to hear of it.
@@ -265,21 +258,33 @@ impl Contents {
         })
     }
 
-    /// Keeps a content on disk, if it is to be; the outcome comes as an [`Input::Stored`].
-    fn keep(&mut self, content: Content, bytes: &Bytes, from_disk: bool, inputs: &mpsc::Sender<Input>) {
-        let Some(disk) = &mut self.disk else { return };
+    /// Keeps a content on disk, if it is to be; the outcome comes as an [`Input::Stored`]. Gives what went from there for it.
+    fn keep(
+        &mut self,
+        content: Content,
+        bytes: &Bytes,
+        from_disk: bool,
+        inputs: &mpsc::Sender<Input>,
+    ) -> Vec<ContentHash> {
+        let Some(disk) = &mut self.disk else { return Vec::new() };
         if from_disk {
             disk.touch(&content.hash);
-        } else if disk.wants(&content) && self.writing_bytes + content.size_bytes <= MAX_WRITING_BYTES {
-            self.writing_bytes += content.size_bytes;
-            let (folder, bytes, inputs) = (disk.folder(), bytes.clone(), inputs.clone());
-            tokio::spawn(async move {
-                let write = move || folder.write(&content.hash, &bytes);
-                let result = tokio::task::spawn_blocking(write).await;
-                let result = result.unwrap_or_else(|error| Err(io::Error::other(error)));
-                let _ = inputs.send(Input::Stored { content, result }).await;
-            });
+            return Vec::new();
         }
+        let Some(gone) = disk.make_way(&content) else { return Vec::new() };
+        self.figures.disk_evictions += gone.len() as u64;
+        let (folder, bytes, inputs, gone_first) =
+            (disk.folder(), bytes.clone(), inputs.clone(), gone.clone());
+        tokio::spawn(async move {
+            let write = move || {
+                gone_first.iter().for_each(|hash| folder.remove(hash));
+                folder.write(&content.hash, &bytes)
+            };
+            let result = tokio::task::spawn_blocking(write).await;
+            let result = result.unwrap_or_else(|error| Err(io::Error::other(error)));
+            let _ = inputs.send(Input::Stored { content, result }).await;
+        });
+        gone
     }
 }
 
