@@ -104,8 +104,8 @@ impl Ledger {
         }
     }
 
-    /// A result's way: the current attempt from the planned node is delivered, anything else is acknowledged (so
-    /// that the node frees it) and dropped.
+    /// A result's way: the current attempt from the planned node is delivered, what came too late is acknowledged (so that the
+    /// node frees it) and dropped, and an attempt that the plan gave to another node is refused.
     pub(super) fn result(&mut self, life: NodeLife, header: ResultHeader) {
         if self.waits_to_be_kept(&header) {
             self.push(Effect::DropPayload { job: header.job, digest: header.digest });
@@ -117,6 +117,13 @@ impl Ledger {
             Some(known) if self.app() == Some(job.job.app) => known.placements().collect(),
             Some(_) | None => Vec::new(),
         };
+        let is_attempt = |place: &&Placement| place.attempt == job.attempt;
+        if let Some(planned) = placements.iter().find(is_attempt).filter(|place| place.life != life) {
+            // Never an honest node's: attempts are sent to the node of their plan alone.
+            tracing::warn!(%job, node = %life.node, planned = %planned.life.node, "a result of a node that the plan does not name");
+            self.push(Effect::DropPayload { job, digest });
+            return;
+        }
         let is_this = |place: &Placement| place.attempt == job.attempt && place.life == life;
         let counts = placements.iter().any(is_this);
         if counts && outcome.is_ok() {

@@ -16,8 +16,8 @@ use farm_core::{
     time::Instant,
 };
 
-const NODE: NodeId = NodeId(1);
-const SESSION: NodeSession = NodeSession(7);
+pub(crate) const NODE: NodeId = NodeId(1);
+pub(crate) const SESSION: NodeSession = NodeSession(7);
 
 pub(crate) struct Application {
     ledger: Ledger,
@@ -71,10 +71,6 @@ impl Application {
             epoch: Epoch(1),
             liveness: Liveness::default(),
         };
-        let devices = vec![DevicePlan { device: DeviceIndex(0), jobs: vec![attempt(0), attempt(1)] }];
-        let contact = Contact { addresses: vec!["127.0.0.1:1".to_owned()], certificate_der: Vec::new() };
-        let plan = NodePlan { node: NODE, session: SESSION, contact, devices };
-        let plan = Plan { batch: None, speculative: false, nodes: vec![plan] };
         app.handle(Event::CoordinatorConnected);
         app.handle(Event::FromCoordinator(welcome));
         if journalled {
@@ -82,9 +78,18 @@ impl Application {
         }
         let jobs = vec![job(0), job(1)];
         app.handle(Event::Submitted { task: TaskId(0), jobs, needs: Requirements::ANY });
-        app.handle(Event::FromCoordinator(CoordinatorToApp::Plan(plan)));
-        app.connect();
+        app.planned(NODE, SESSION, vec![attempt(0), attempt(1)]);
         app
+    }
+
+    /// Attempts are planned on a node, which is linked with.
+    pub(crate) fn planned(&mut self, node: NodeId, session: NodeSession, jobs: Vec<JobAttempt>) {
+        let devices = vec![DevicePlan { device: DeviceIndex(0), jobs }];
+        let contact = Contact { addresses: vec!["127.0.0.1:1".to_owned()], certificate_der: Vec::new() };
+        let nodes = vec![NodePlan { node, session, contact, devices }];
+        let plan = Plan { batch: None, speculative: false, nodes };
+        self.handle(Event::FromCoordinator(CoordinatorToApp::Plan(plan)));
+        self.connect_with(node, session);
     }
 
     pub(crate) fn handle(&mut self, event: Event) {
@@ -93,8 +98,12 @@ impl Application {
     }
 
     pub(crate) fn connect(&mut self) {
-        self.handle(Event::NodeConnected { node: NODE, session: SESSION });
-        self.hears(NodeToApp::Welcome { node: NODE, session: SESSION });
+        self.connect_with(NODE, SESSION);
+    }
+
+    fn connect_with(&mut self, node: NodeId, session: NodeSession) {
+        self.handle(Event::NodeConnected { node, session });
+        self.handle(Event::FromNode { node, session, message: NodeToApp::Welcome { node, session } });
     }
 
     pub(crate) fn loses_link(&mut self) {
@@ -126,13 +135,7 @@ impl Application {
     }
 
     pub(crate) fn result(&mut self, index: u32) {
-        self.hears(NodeToApp::Result(ResultHeader {
-            job: attempt(index),
-            device: DeviceIndex(0),
-            device_time_ns: 1,
-            outcome: Ok(vec![4]),
-            digest: ContentHash([2; 32]),
-        }));
+        self.hears(result(index));
     }
 
     pub(crate) fn kept(&mut self, index: u32) {
@@ -158,6 +161,16 @@ impl Application {
         }
         self.ledger.check_invariants();
     }
+}
+
+pub(crate) fn result(index: u32) -> NodeToApp {
+    NodeToApp::Result(ResultHeader {
+        job: attempt(index),
+        device: DeviceIndex(0),
+        device_time_ns: 1,
+        outcome: Ok(vec![4]),
+        digest: ContentHash([2; 32]),
+    })
 }
 
 pub(crate) fn attempt(index: u32) -> JobAttempt {
