@@ -157,11 +157,11 @@ fn beat(lead: &Weak<Lead>) {
     }
 }
 
-/// Waits until nobody leads, and gives the term that is over; `None` if there never was one. Says in the log who is waited for.
+/// Waits until nobody leads, and gives the term that is over, 0 if there never was one. Says in the log who is waited for.
 ///
 /// # Errors
 /// The directory cannot be used.
-pub async fn stand_by(directory: &Path, liveness: Liveness) -> Result<Option<u64>, StartError> {
+pub async fn stand_by(directory: &Path, liveness: Liveness) -> Result<u64, StartError> {
     let mut watch = Watch { directory: directory.to_owned(), own_dead_ms: liveness.dead_ms, seen: None };
     loop {
         let looked = tokio::task::spawn_blocking(move || (watch.look(), watch)).await;
@@ -176,7 +176,7 @@ pub async fn stand_by(directory: &Path, liveness: Liveness) -> Result<Option<u64
 
 enum Look {
     Led,
-    Free(Option<u64>),
+    Free(u64),
 }
 
 /// What a standby has seen of the leader.
@@ -197,7 +197,7 @@ impl Watch {
         fs::create_dir_all(&self.directory)?;
         let term = latest(&self.directory)?;
         if term == 0 {
-            return Ok(Look::Free(None));
+            return Ok(Look::Free(0));
         }
         let file = match File::open(path(&self.directory, term)) {
             Ok(file) => file,
@@ -227,11 +227,11 @@ impl Watch {
             content.is_some_and(|content| !content.boot.is_empty() && content.boot == line_of(BOOT_FILE));
         if here && file.try_lock_shared().is_ok() {
             tracing::warn!(term, "the leader's process has ended: taking over");
-            return Ok(Look::Free(Some(term)));
+            return Ok(Look::Free(term));
         }
         if silent >= Duration::from_millis(dead_ms) {
             tracing::warn!(term, ?silent, "the leader is silent: taking over");
-            return Ok(Look::Free(Some(term)));
+            return Ok(Look::Free(term));
         }
         Ok(Look::Led)
     }
@@ -302,7 +302,7 @@ mod tests {
     #[tokio::test]
     async fn a_standby_waits_for_the_leader_and_only_one_follows_it() {
         let directory = tempfile::tempdir().unwrap();
-        assert_eq!(stand_by(directory.path(), soon()).await.unwrap(), None, "nobody ever led");
+        assert_eq!(stand_by(directory.path(), soon()).await.unwrap(), 0, "nobody ever led");
         let first = Lead::take(directory.path(), Some(0), soon()).unwrap();
         assert!(matches!(Lead::take(directory.path(), Some(0), soon()), Err(StartError::Outrun)));
         let waiting = stand_by(directory.path(), soon());
@@ -311,9 +311,12 @@ mod tests {
         assert!(early.is_err(), "three times the silence that counts: it beats");
         drop(first);
         let term = waiting.await.unwrap();
-        assert_eq!(term, Some(1));
-        let second = Lead::take(directory.path(), term, soon()).unwrap();
-        assert!(matches!(Lead::take(directory.path(), term, soon()), Err(StartError::Outrun)), "one follows");
+        assert_eq!(term, 1);
+        let second = Lead::take(directory.path(), Some(term), soon()).unwrap();
+        assert!(
+            matches!(Lead::take(directory.path(), Some(term), soon()), Err(StartError::Outrun)),
+            "one follows"
+        );
         second.forget_earlier();
         assert_eq!(terms(directory.path()).unwrap(), [2]);
         second.holds().unwrap();
@@ -351,10 +354,10 @@ mod tests {
         let file = path(directory.path(), 3);
         fs::write(&file, content.to_text()).unwrap();
         let began = Instant::now();
-        assert_eq!(stand_by(directory.path(), soon()).await.unwrap(), Some(3));
+        assert_eq!(stand_by(directory.path(), soon()).await.unwrap(), 3);
         assert!(began.elapsed() >= Duration::from_millis(400), "nobody holds its lock, which says nothing");
         // A garbled one counts as silent, too.
         fs::write(&file, "\0\u{1}").unwrap();
-        assert_eq!(stand_by(directory.path(), soon()).await.unwrap(), Some(3));
+        assert_eq!(stand_by(directory.path(), soon()).await.unwrap(), 3);
     }
 }

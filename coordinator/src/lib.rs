@@ -62,8 +62,8 @@ pub struct CoordinatorOptions {
     pub http: SocketAddr,
     /// Where the epoch and members are kept; `None`: nowhere, the epoch is the time of the start.
     pub state: Option<PathBuf>,
-    /// The term of the leader that this coordinator follows, if [`stand_by`] gave one; its process may still have the state
-    /// directory open.
+    /// The term that this coordinator's is to follow, as [`stand_by`] gave it: the leader's process may still have the state
+    /// directory open. `None`: no coordinator uses the directory, or the start fails.
     pub predecessor: Option<u64>,
     /// Whether members of the farm alone are let in, by the authority in the state directory.
     pub secured: bool,
@@ -298,10 +298,12 @@ pub async fn start(options: CoordinatorOptions) -> Result<CoordinatorHandle, Sta
 /// Opens the state directory as the one coordinator that leads by it.
 fn lead_by(directory: &Path, options: &CoordinatorOptions) -> Result<Store, StartError> {
     let take = || Lead::take(directory, options.predecessor, options.liveness);
-    let (store, lead) = if options.predecessor.is_some() {
+    let (store, lead) = if let Some(predecessor) = options.predecessor {
         let lead = take()?;
-        // The predecessor may hold the lock, stopped as it is.
-        Store::copy_aside(directory)?;
+        if predecessor > 0 {
+            // It may hold the lock, stopped as it is.
+            Store::copy_aside(directory)?;
+        }
         (Store::open(directory)?, lead)
     } else {
         // Its lock says that nobody leads.

@@ -91,7 +91,7 @@ async fn start(mut options: CoordinatorOptions, standby: bool) -> anyhow::Result
     }
     loop {
         if let Some(directory) = &directory {
-            options.predecessor = coordinator::stand_by(directory, options.liveness).await?;
+            options.predecessor = Some(coordinator::stand_by(directory, options.liveness).await?);
         }
         match coordinator::start(options.clone()).await {
             // Another standby was faster.

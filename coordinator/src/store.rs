@@ -139,7 +139,11 @@ impl Store {
     pub(crate) fn copy_aside(directory: &Path) -> Result<(), StartError> {
         let (path, copy) = (directory.join(FILE), directory.join(COPY));
         let copied = || {
-            fs::copy(&path, &copy)?;
+            match fs::copy(&path, &copy) {
+                // It did not come to make one.
+                Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(()),
+                copied => copied?,
+            };
             fs::File::open(&copy)?.sync_all()?;
             fs::rename(&copy, &path)?;
             fs::File::open(directory)?.sync_all()

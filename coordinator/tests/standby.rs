@@ -68,7 +68,7 @@ async fn a_standby_follows_a_leader_that_ended_without_waiting() {
     let directory = state.path().to_owned();
     let waiting = tokio::spawn(async move { stand_by(&directory, liveness).await });
     first.shutdown().await;
-    assert_eq!(waiting.await.unwrap().unwrap(), Some(1), "its process lets go of the lock");
+    assert_eq!(waiting.await.unwrap().unwrap(), 1, "its process lets go of the lock");
 }
 
 /// Of several addresses the one that leads is found, whichever it is; one that only takes connections does not count.
