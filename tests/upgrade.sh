@@ -225,7 +225,7 @@ else
 fi
 
 for log in "$work"/*.log; do
-    ! grep -H -i -E 'panicked at|decod|malformed' "$log" || fault "see $(basename "$log")"
+    ! grep -H -i -m 1 -E 'panicked at|decod|malformed' "$log" || fault "see $(basename "$log")"
 done
 [ "$faults" = 0 ] || { say "$faults faults"; exit 1; }
 say "all as it should be"
