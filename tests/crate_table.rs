@@ -64,7 +64,7 @@ const RESTRICTED: [(&str, &[&str]); 13] = [
 ];
 
 /// What tests of a crate may name besides: devices to run kernels on, naga to check layouts, a farm to link against, what a
-/// simulated network stands in for.
+/// simulated network stands in for and attackers speak.
 const ALSO_IN_TESTS: [(&str, &[&str]); 5] = [
     ("bdpt-kernel", &["gpu-exec", "naga"]),
     ("mi-kernel", &["gpu-exec", "naga"]),

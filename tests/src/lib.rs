@@ -6,7 +6,7 @@ pub mod sim;
 use std::{
     env,
     ffi::OsStr,
-    fs::OpenOptions,
+    fs::{self, OpenOptions},
     io::{BufRead, BufReader, Read},
     path::PathBuf,
     process::{Child, ChildStdout, Command, ExitStatus, Output, Stdio},
@@ -163,6 +163,20 @@ impl Process {
                 return line;
             }
         }
+    }
+
+    /// The most memory that it has had resident so far, in bytes.
+    ///
+    /// # Panics
+    /// The process is gone already.
+    #[must_use]
+    pub fn peak_resident_bytes(&self) -> u64 {
+        let status = fs::read_to_string(format!("/proc/{}/status", self.child.id()));
+        let status = status.expect("Linux tells of its processes");
+        let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:"));
+        let number = line.and_then(|line| line.split_whitespace().next()?.parse::<u64>().ok());
+        let kib = number.unwrap_or_else(|| panic!("{} is gone", self.name));
+        kib << 10
     }
 
     /// Sends a signal.

@@ -37,8 +37,8 @@ pub use self::{
     },
     stream::{Caller, ControlStream},
     transport::{
-        ADMIN_TIMEOUT, MAX_MESSAGE_BYTES, admin_server, apps_server, coordinator_addresses, nodes_server,
-        server, trust_server,
+        ADMIN_TIMEOUT, CONNECTION_WINDOW_BYTES, MAX_MESSAGE_BYTES, admin_server, apps_server,
+        coordinator_addresses, nodes_server, server, trust_server,
     },
     trust::{
         Invitation, create_token, expel, join, list_members, list_tokens, remove_project, renew,

@@ -32,7 +32,7 @@ const KEEP_ALIVE_TIMEOUT: Duration = Duration::from_secs(5);
 /// Unread bytes of one session, at most: a plan of 4,096 jobs is about 10 kB.
 const STREAM_WINDOW_BYTES: u32 = 4 << 20;
 /// Unread bytes of one connection, at most.
-const CONNECTION_WINDOW_BYTES: u32 = 8 << 20;
+pub const CONNECTION_WINDOW_BYTES: u32 = 8 << 20;
 /// Most addresses of a farm's coordinators.
 const MAX_COORDINATORS: usize = 8;
 /// Sessions and requests of one connection at a time.

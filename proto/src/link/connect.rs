@@ -41,7 +41,7 @@ const IDLE_TIMEOUT_MS: u32 = 5_000;
 /// Unread bytes of one stream, at most.
 const STREAM_WINDOW_BYTES: u32 = 16 << 20;
 /// Unread bytes of one link, at most.
-const LINK_WINDOW_BYTES: u32 = 64 << 20;
+pub const LINK_WINDOW_BYTES: u32 = 64 << 20;
 /// Bytes sent on one link and not acknowledged, at most.
 const SEND_WINDOW_BYTES: u64 = 32 << 20;
 /// The largest UDP payload tried. Ten of them, the network stack's segments for each system call, must fit one UDP

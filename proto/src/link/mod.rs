@@ -34,7 +34,9 @@ use thiserror::Error;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 
 pub use self::{
-    connect::{BindError, CONNECT_TIMEOUT, ConnectError, DataServer, Incoming, MAX_LINKS, connect},
+    connect::{
+        BindError, CONNECT_TIMEOUT, ConnectError, DataServer, Incoming, LINK_WINDOW_BYTES, MAX_LINKS, connect,
+    },
     fetch::{Arrived, FetchError, STALL_TIMEOUT},
     outline::{ContentBytes, PIECE_BYTES},
     receive::LinkReceiver,
