@@ -1,9 +1,10 @@
 //! The whole farm as real processes on 127.0.0.1: a coordinator, workers on lavapipe, `farmctl` as the application.
 //! Whatever happens to the workers, the image is byte for byte the undisturbed one.
 
-use std::{fs, path::Path};
+use std::{collections::BTreeMap, fs, path::Path};
 
 use client_sdk::Journal;
+use serde_json::Value;
 use tempfile::TempDir;
 use tests::{Farm, Process, Signal, farmctl};
 
@@ -84,23 +85,46 @@ fn a_render_that_was_killed_goes_on_from_its_journal_byte_for_byte() {
     let kept = Journal::open(&journal, label).expect("what a kill leaves can be used").results();
     assert!(kept > 0, "some results are in the journal");
 
-    // Another picture under the same name: refused with the reason and what to do, and nothing is lost.
-    let other =
-        ["--coordinator", &farm.grpc, "render", &scene, "-o", &image.display().to_string(), "--resume"];
-    let refused = farmctl(other.iter().chain(&["--size", "32x32", "--spp", "2"]));
-    let words = String::from_utf8_lossy(&refused.stderr).into_owned();
-    assert_eq!(refused.status.code(), Some(2), "{words}");
-    assert!(words.contains("of another run") && words.contains("32x32") && words.contains("rm "), "{words}");
-
     let mut resumed = start_render_with(&farm, &scene, &image, &["--resume"]);
     let done = resumed.wait_for(|line| line["event"] == "done");
     let (status, stderr) = resumed.finish();
     assert!(status.success(), "{status}; stderr:\n{stderr}");
     assert!(stderr.contains(&format!("{kept} results")), "what was taken over is said:\n{stderr}");
     assert_eq!(done["jobs_journalled"].as_u64(), Some(kept), "{done}");
-    println!("s09: {kept} of {} jobs taken over", done["jobs"]);
+    let (before, since) = completed_by_the_last_two(&farm);
+    let ended_first = since.iter().map(|job| job.ended_at).min().expect("it had jobs left");
+    let late = before.iter().filter(|job| job.started_at > ended_first).count();
+    assert_eq!(late, 0, "of the killed render nothing begins any more");
+    let jobs = done["jobs"].as_u64().expect("a number");
+    let again = (before.len() + since.len()) as u64 - jobs;
+    println!(
+        "s09: {kept} of {jobs} jobs taken over, {again} computed again; bar: 5 %, or what is on the devices and on its way"
+    );
     assert!(fs::read(&image).expect("the image is there") == quiet, "the images differ in bytes");
     assert!(!journal.exists(), "a journal is removed when the image is written");
+}
+
+/// When a job ran, on the coordinator's clock.
+struct Ran {
+    started_at: u64,
+    ended_at: u64,
+}
+
+/// What the last two applications of a farm have completed.
+fn completed_by_the_last_two(farm: &Farm) -> (Vec<Ran>, Vec<Ran>) {
+    let output = farmctl(["--coordinator", &farm.grpc, "timeline", "@all", "-o", "json"]);
+    let timeline: Value = serde_json::from_slice(&output.stdout).expect("the timeline is JSON");
+    let mut of_apps: BTreeMap<u64, Vec<Ran>> = BTreeMap::new();
+    for segment in timeline["segments"].as_array().expect("segments") {
+        let number = |value: &Value| value.as_u64().unwrap_or_else(|| panic!("a number in {segment}"));
+        let ran = Ran { started_at: number(&segment["started_at"]), ended_at: number(&segment["ended_at"]) };
+        if segment["outcome"] == "completed" {
+            of_apps.entry(number(&segment["job"]["job"]["app"])).or_default().push(ran);
+        }
+    }
+    let (_, last) = of_apps.pop_last().expect("the last application");
+    let (_, before) = of_apps.pop_last().expect("the one before it");
+    (before, last)
 }
 
 #[test]
@@ -115,6 +139,14 @@ fn a_scene_that_was_changed_does_not_meet_old_results() {
     let (status, stderr) = render.finish();
     assert_eq!(status.code(), Some(1), "an incomplete image is not a success; stderr:\n{stderr}");
     assert!(stderr.contains("the same command goes on"), "what to do is said:\n{stderr}");
+
+    // Another picture under the same name: refused with the reason and what to do, and nothing is lost.
+    let other =
+        ["--coordinator", &farm.grpc, "render", &scene, "-o", &image.display().to_string(), "--resume"];
+    let refused = farmctl(other.iter().chain(&["--size", "32x32", "--spp", "2"]));
+    let words = String::from_utf8_lossy(&refused.stderr).into_owned();
+    assert_eq!(refused.status.code(), Some(2), "{words}");
+    assert!(words.contains("of another run") && words.contains("32x32") && words.contains("rm "), "{words}");
 
     let materials = folder.path().join("cornell");
     let materials =
@@ -138,7 +170,7 @@ fn a_scene_that_was_changed_does_not_meet_old_results() {
 
 #[test]
 fn another_seed_gives_another_image() {
-    // Negative control of the byte comparison above.
+    // Negative control of the byte comparisons above.
     let folder = TempDir::new().expect("a temporary folder");
     let scene = cornell(&folder);
     let render = |seed: &str| {

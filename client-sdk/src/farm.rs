@@ -8,6 +8,7 @@ use std::{
     thread,
 };
 
+use farm_core::id::AppId;
 use proto::control::{SessionError, connect_app};
 use tokio::{
     sync::{oneshot, watch},
@@ -30,6 +31,8 @@ use crate::{
 #[derive(Debug)]
 pub struct Farm {
     options: FarmOptions,
+    /// As which application it was registered.
+    app: AppId,
     driver: DriverHandle,
     driver_task: JoinHandle<()>,
     store: ContentStore,
@@ -95,9 +98,10 @@ impl Farm {
             closing: closing_receiver,
         }));
         // From here on an early return drops `closing`, and the driver ends.
-        registration.await.unwrap_or(Err(FarmError::Closed))?;
+        let app = registration.await.unwrap_or(Err(FarmError::Closed))?;
         Ok(Self {
             options,
+            app,
             driver,
             driver_task,
             store,
@@ -120,6 +124,9 @@ impl Farm {
     /// process that runs the same graph with the same journal goes on from there: `dispatch` is called as ever, and `retrieve` of
     /// the jobs whose programs the journal has results of, with the bytes that it has, once each. So an application that was killed
     /// comes to the same state by the same calls, and what it had retrieved is not computed again.
+    ///
+    /// The application that ran with the journal before, if its process was killed and the coordinator keeps its place still, is over
+    /// at once: what it left at the nodes would be computed beside this run, and again by it.
     ///
     /// The file stays when the run has ended, in whatever way; remove it when what became of the results is safe.
     ///
@@ -149,6 +156,7 @@ impl Farm {
             tasks: tasks.clone(),
             nodes,
             window: self.options.window,
+            app: self.app,
             journal,
             store: self.store.clone(),
             driver: self.driver.clone(),

@@ -14,6 +14,7 @@ use client_sdk::{
     Window,
 };
 use coordinator::{CoordinatorHandle, CoordinatorOptions};
+use farm_core::coordinator::timeline::{Outcome, Segment, TimelineQuery};
 use worker::{WorkerHandle, WorkerOptions};
 
 /// A coordinator and its workers.
@@ -632,6 +633,62 @@ async fn an_application_that_ends_in_mid_run_goes_on_from_its_journal() {
     assert_eq!(app.run_journalled(graph(&third), open()).await.unwrap().journalled, u64::from(JOBS));
     assert_eq!(third.lock().unwrap().len(), JOBS as usize);
     app.close().await;
+    farm.stop().await;
+}
+
+/// Scenario 9, the process killed: its queue at the nodes would be computed beside the run that goes on, for a lease of 30 s.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_run_that_goes_on_ends_its_predecessor_at_once() {
+    const JOBS: u32 = 400;
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("journal");
+    let farm = TestFarm::start(2, &["sim", "sim"]).await;
+    let graph = || {
+        let cost = CostNs(20_000_000);
+        TaskGraph::new().task("echo", Echoes { jobs: JOBS, cost, module: module(), ..Echoes::default() })
+    };
+    let (options, first_graph) = (farm.options(), graph());
+    let journal = Journal::open(&path, "echoes").unwrap();
+    let killed = std::thread::spawn(move || {
+        // As a process that is killed: from one moment on none of its tasks says another word.
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+        let app = runtime.block_on(Farm::connect(options)).unwrap();
+        let mut progress = app.progress();
+        runtime.block_on(async {
+            tokio::select! {
+                outcome = app.run_journalled(first_graph, journal) => panic!("it was to be killed: {outcome:?}"),
+                _ = progress.wait_for(|progress| progress.jobs_done >= u64::from(JOBS) / 2) => {}
+            }
+        });
+        drop(runtime);
+        progress
+    });
+    let mut progress = tokio::task::spawn_blocking(|| killed.join().unwrap()).await.unwrap();
+    // With the last one who could tell of progress the journal is free.
+    while progress.changed().await.is_ok() {}
+
+    let journal = Journal::open(&path, "echoes").unwrap();
+    let kept = journal.results();
+    let app = farm.connect().await;
+    let summary = app.run_journalled(graph(), journal).await.unwrap();
+    assert_eq!((summary.jobs, summary.journalled), (u64::from(JOBS), kept));
+    app.close().await;
+
+    let everything = TimelineQuery { app: None, task: None, max_segments: 10_000 };
+    let timeline = proto::control::timeline(&farm.address(), None, everything).await.unwrap();
+    let completed = timeline.segments.iter().filter(|segment| segment.outcome == Outcome::Completed);
+    let predecessor = timeline.segments.iter().map(|segment| segment.job.job.app).min();
+    let (before, since): (Vec<&Segment>, Vec<&Segment>) =
+        completed.partition(|segment| Some(segment.job.job.app) == predecessor);
+    let first_end = since.iter().map(|segment| segment.ended_at).min().unwrap();
+    let late = before.iter().filter(|segment| segment.started_at > first_end).count();
+    assert_eq!(late, 0, "of the predecessor nothing begins any more");
+    // What each of the four devices ran when its application left is not told, and was for nothing too.
+    let again = before.len() + since.len() + 4 - JOBS as usize;
+    println!(
+        "s09: killed with {kept} of {JOBS} in the journal, at most {again} computed again, bar 20 (5 %)"
+    );
+    assert!(again <= JOBS as usize / 20, "{again}: {} before, {} since", before.len(), since.len());
     farm.stop().await;
 }
 

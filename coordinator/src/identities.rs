@@ -10,9 +10,12 @@ use farm_core::{
     id::{AppId, AppIncarnation, Epoch, LinkId},
     message::{AppToCoordinator, CoordinatorToApp, NodeToCoordinator},
 };
-use proto::trust::{Capability, Member};
+use proto::trust::{Capability, Member, Principal};
 
 use crate::security::{CAPABILITY_LIFETIME, Gate};
+
+/// Owners of applications are kept for those that have left, too, until they come to this many: twice what the machine registers.
+const MAX_OWNERS: usize = 32_768;
 
 /// A capability of this age is followed by a new one.
 const RENEW_AFTER: Duration = CAPABILITY_LIFETIME.checked_div(2).expect("two is not zero");
@@ -23,6 +26,8 @@ pub(crate) struct Identities {
     gate: Gate,
     /// The capability given on a connection.
     given: HashMap<LinkId, Given>,
+    /// Who the applications are of that this coordinator has registered.
+    owners: HashMap<AppId, Principal>,
 }
 
 #[derive(Debug)]
@@ -35,7 +40,7 @@ struct Given {
 
 impl Identities {
     pub(crate) fn new(gate: Gate) -> Self {
-        Self { gate, given: HashMap::new() }
+        Self { gate, given: HashMap::new(), owners: HashMap::new() }
     }
 
     /// Whether somebody let in is no member any more.
@@ -58,6 +63,17 @@ impl Identities {
         }
         let reason = format!("{} does not show that {app} is its own", member.principal);
         Err(self.refused("resume an application", member, reason))
+    }
+
+    /// Whether somebody may say that they go on for an application: it is their own, or unknown. If not, it is written down, and
+    /// that is all: who goes on from a colleague's journal may do so, the predecessor is just not theirs to end.
+    pub(crate) fn may_supersede(&self, member: Option<&Member>, app: AppId) -> bool {
+        let Some(member) = member else { return true };
+        let another = self.owners.get(&app).filter(|owner| **owner != member.principal);
+        if let Some(owner) = another {
+            self.gate.refused("supersede an application", &member.principal, &format!("{app} is {owner}'s"));
+        }
+        another.is_none()
     }
 
     /// # Errors
@@ -87,6 +103,20 @@ impl Identities {
     fn refused(&self, what: &str, member: &Member, reason: String) -> String {
         self.gate.refused(what, &member.principal, &reason);
         reason
+    }
+
+    /// Keeps in mind whose an application is that is welcomed. `is_registered` says which are there still.
+    pub(crate) fn welcomes(
+        &mut self,
+        member: Option<&Member>,
+        message: &CoordinatorToApp,
+        is_registered: impl Fn(AppId) -> bool,
+    ) {
+        let (Some(member), &CoordinatorToApp::Welcome { app, .. }) = (member, message) else { return };
+        if self.owners.len() >= MAX_OWNERS {
+            self.owners.retain(|&app, _| is_registered(app));
+        }
+        self.owners.insert(app, member.principal.clone());
     }
 
     /// What an application is to be given before a message: with its welcome, and with an answer when the last one ages.

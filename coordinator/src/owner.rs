@@ -172,6 +172,11 @@ impl Owner {
                 let Some(peer) = self.apps.get(&link) else { return };
                 match self.identities.check_app(peer.member.as_ref(), peer.shown.as_ref(), &message) {
                     Ok(()) => {
+                        if let AppToCoordinator::Supersede(app) = message
+                            && !self.identities.may_supersede(peer.member.as_ref(), app)
+                        {
+                            return;
+                        }
                         if matches!(message, AppToCoordinator::Hello(_)) {
                             let project = peer.project.clone();
                             self.machine.handle(now, Event::AppIntroduced { link, project });
@@ -276,6 +281,8 @@ impl Owner {
             peer.refused = Some(reason.clone());
             self.identities.refused_by_quota(peer.member.as_ref(), reason);
         }
+        let machine = &self.machine;
+        self.identities.welcomes(peer.member.as_ref(), &message, |app| machine.knows_app(app));
         let capability = peer
             .member
             .as_ref()

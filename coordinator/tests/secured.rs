@@ -385,6 +385,41 @@ async fn nobody_goes_on_as_somebody_elses_application() {
     handle.shutdown().await;
 }
 
+/// Only its member ends an application before its lease does; who tries goes on, and what was tried is written down.
+#[tokio::test(flavor = "multi_thread")]
+async fn nobody_ends_somebody_elses_application() {
+    let farm = Farm::start().await;
+    let other = join(&farm.address, &farm.operator, Role::App, "other").await;
+    let (session, (predecessor, _), _) = app(&farm.address, &farm.app, None, &[]).await.unwrap();
+    drop(session);
+    let is_there = async || {
+        let status = control::status(&farm.address, Some(&farm.operator)).await.unwrap();
+        status.apps.iter().any(|app| app.app == predecessor)
+    };
+    let mut answers = Vec::new();
+    for who in [&other, &farm.operator, &farm.app] {
+        let (mut session, ..) = app(&farm.address, who, None, &[]).await.unwrap();
+        session.sender.try_send(AppToCoordinator::Supersede(predecessor)).unwrap();
+        session.sender.try_send(AppToCoordinator::Heartbeat { sequence: 1, unanswered: false }).unwrap();
+        let heard = session.receiver.recv().await.unwrap();
+        assert!(matches!(heard, CoordinatorToApp::HeartbeatAck { sequence: 1 }), "{heard:?}");
+        // Its end may be noticed after that.
+        if who.principal() == farm.app.principal() {
+            while is_there().await {
+                tokio::task::yield_now().await;
+            }
+        }
+        answers.push(is_there().await);
+    }
+    assert_eq!(answers, [true, true, false], "its own member alone");
+    let audit = farm.audit();
+    let refusals: Vec<&str> =
+        audit.lines().filter(|line| line.contains("supersede an application")).collect();
+    assert_eq!(refusals.len(), 2, "{audit}");
+    assert!(refusals[0].contains("app/other") && refusals[0].contains("app-1 is"), "{audit}");
+    farm.handle.shutdown().await;
+}
+
 /// The hostile test of 2026-11-26, further findings.
 #[tokio::test(flavor = "multi_thread")]
 async fn who_is_out_is_out_at_once_and_so_is_whom_they_invited() {

@@ -18,7 +18,7 @@ use crate::{
 };
 
 /// The protocol this build speaks. A peer of another version is refused at hello.
-pub const PROTOCOL_VERSION: u32 = 6;
+pub const PROTOCOL_VERSION: u32 = 7;
 
 /// Whether a peer that says this version in its hello is spoken to.
 ///
@@ -273,6 +273,8 @@ pub enum AppToCoordinator {
     },
     /// Forget the undelivered jobs of this task and stop them.
     Cancel(TaskId),
+    /// This application goes on with what that one, whose process is dead, has begun: its lease is of no use to anybody.
+    Supersede(AppId),
     /// Alive.
     Heartbeat {
         /// Echoed in the answer.

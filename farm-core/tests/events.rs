@@ -144,6 +144,7 @@ fn coordinator_event(step: Step) -> coordinator::Event {
         12 => from_app(AppToCoordinator::Cancel(TaskId(step.three.into()))),
         14 => from_app(AppToCoordinator::Heartbeat { sequence: 1, unanswered: step.four == 0 }),
         16 if step.four == 0 => from_app(AppToCoordinator::Goodbye),
+        16 => from_app(AppToCoordinator::Supersede(AppId(step.two.into()))),
         1 | 3 => from_node(NodeToCoordinator::Hello(NodeHello {
             protocol: PROTOCOL_VERSION,
             node: step.one.is_multiple_of(2).then(|| NodeId(step.one.into())),
@@ -452,6 +453,7 @@ fn ledger_event(step: Step) -> ledger::Event {
         23 if step.four == 0 && step.three == 0 => ledger::Event::Finished,
         24 if step.four == 0 => ledger::Event::Journalled(TaskId(step.three.into())),
         24 => ledger::Event::Kept { task: TaskId(step.three.into()), index: JobIndex(step.one.into()) },
+        25 if step.four == 0 => ledger::Event::Supersedes(AppId(step.two.into())),
         _ => ledger::Event::FromCoordinator(CoordinatorToApp::HeartbeatAck { sequence: 1 }),
     }
 }

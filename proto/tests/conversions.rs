@@ -176,6 +176,7 @@ fn app_to_coordinator() -> impl Strategy<Value = AppToCoordinator> {
             session: NodeSession(session)
         }),
         any::<u32>().prop_map(|task| AppToCoordinator::Cancel(TaskId(task))),
+        any::<u64>().prop_map(|app| AppToCoordinator::Supersede(AppId(app))),
         any::<(u64, bool)>()
             .prop_map(|(sequence, unanswered)| AppToCoordinator::Heartbeat { sequence, unanswered }),
         Just(AppToCoordinator::Goodbye),

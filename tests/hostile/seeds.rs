@@ -69,6 +69,9 @@ pub(crate) const SEEDS: &[Seed] = &[
             attempts(5).iter().map(|job| job.job).collect(),
         ))
     }),
+    ("app_to_coordinator", "valid-supersede", || {
+        app_to_coordinator(AppToCoordinator::Supersede(AppId(3 << 32 | 7)))
+    }),
     ("coordinator_to_app", "valid-plan", || coordinator_to_app(CoordinatorToApp::Plan(plan()))),
     ("coordinator_to_app", "valid-welcome", || {
         coordinator_to_app(CoordinatorToApp::Welcome {

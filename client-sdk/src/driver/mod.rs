@@ -15,7 +15,7 @@ use std::{
 use bytes::Bytes;
 use farm_core::{
     device::Requirements,
-    id::{JobAttempt, JobIndex, NodeId, TaskId},
+    id::{AppId, JobAttempt, JobIndex, NodeId, TaskId},
     ledger::{Effect, Event, Ledger, SubmittedJob},
     message::{AppHello, AppToCoordinator, CoordinatorToApp, NodeToApp},
     time,
@@ -58,6 +58,8 @@ type JobKey = (TaskId, JobIndex);
 pub(crate) enum Input {
     /// A run wants to hear of its tasks.
     RunStarted { tasks: Range<u32>, events: std_mpsc::Sender<RunEvent>, acknowledge: Acknowledge },
+    /// A run goes on for an earlier application.
+    Supersedes(AppId),
     /// Results of a run are in its journal.
     Kept(Vec<JobKey>),
     /// A batch of a run.
@@ -130,6 +132,11 @@ impl DriverHandle {
         self.inputs.blocking_send(Input::Submitted(submission)).map_err(|_| FarmError::Closed)
     }
 
+    /// From a thread: says which application a run goes on for. Jobs are submitted after it.
+    pub(crate) fn supersedes(&self, predecessor: AppId) -> Result<(), FarmError> {
+        self.inputs.blocking_send(Input::Supersedes(predecessor)).map_err(|_| FarmError::Closed)
+    }
+
     /// From a thread: says that results are safe.
     pub(crate) fn kept(&self, jobs: Vec<JobKey>) {
         // Without a driver there is nobody to acknowledge them to.
@@ -150,7 +157,7 @@ pub(crate) struct DriverSetup {
     pub(crate) inputs: mpsc::Receiver<Input>,
     pub(crate) session: AppSession,
     /// Hears whether the coordinator takes the application.
-    pub(crate) registered: oneshot::Sender<Result<(), FarmError>>,
+    pub(crate) registered: oneshot::Sender<Result<AppId, FarmError>>,
     pub(crate) contents: ContentSource,
     pub(crate) progress: watch::Sender<Progress>,
     pub(crate) stop: watch::Receiver<bool>,
@@ -172,7 +179,7 @@ struct Driver {
     /// Payloads of the results handed to the ledger in this turn, in that order: it answers each with `Deliver` or
     /// `DropPayload`.
     payloads: VecDeque<(JobAttempt, Payload)>,
-    registered: Option<oneshot::Sender<Result<(), FarmError>>>,
+    registered: Option<oneshot::Sender<Result<AppId, FarmError>>>,
     /// Why nothing further will work.
     over: Option<Over>,
     progress: watch::Sender<Progress>,
@@ -278,6 +285,7 @@ impl Driver {
                 let refused = self.over.as_ref().map(|over| RunEnd::Farm(over.error(&self.options)));
                 self.runs.start(tasks, events, refused);
             }
+            Input::Supersedes(predecessor) => self.tell_ledger(Event::Supersedes(predecessor)),
             Input::Kept(jobs) => {
                 for (task, index) in jobs {
                     self.tell_ledger(Event::Kept { task, index });
@@ -351,7 +359,7 @@ impl Driver {
             CoordinatorToApp::Welcome { app, .. } => {
                 tracing::debug!(%app, "registered");
                 self.coordinator.welcomed();
-                self.answer_registration(Ok(()));
+                self.answer_registration(Ok(*app));
             }
             CoordinatorToApp::Plan(plan) => self.runs.planned(plan),
             CoordinatorToApp::Refused { .. }
@@ -382,7 +390,7 @@ impl Driver {
         self.tell_ledger(Event::CoordinatorLost);
     }
 
-    fn answer_registration(&mut self, answer: Result<(), FarmError>) {
+    fn answer_registration(&mut self, answer: Result<AppId, FarmError>) {
         if let Some(registered) = self.registered.take() {
             // Whoever asked may have given up; the farm is dropped then, and this task ends.
             let _ = registered.send(answer);

@@ -2,22 +2,29 @@
 //!
 //! ```text
 //! header   "gleaner-journal\n" | version u32 | label length u32 | label | check
-//! record   head (48 B) | meta | payload: the result's sections, one after the other
-//! head     mark | offset of the head u64 | durable u64 | payload length u64 | meta length u32 | 0 u32 | check
-//! meta     program [32] | payload digest [32] | node u64 | device time in ns u64 | index u32
-//!          | number of sections u32 | their lengths u64.. | task name | check
+//! record   head (48 B) | meta | payload
+//! head     mark | offset of the head u64 | durable u64 | payload length u64 | meta length u32 | kind u32 | check
+//! result   kind 0; meta: program [32] | payload digest [32] | node u64 | device time in ns u64 | index u32
+//!          | number of sections u32 | their lengths u64.. | task name | check; payload: the sections, one after the other
+//! writer   kind 1; meta: application u64 | check; no payload: whose results follow
 //! ```
+//! Format 1 is the same without writers: it is read, and gone on with as it is.
+//!
 //! Numbers are little-endian. A check is the first eight bytes of blake3 over what comes before it in its part. `durable` says
 //! how many bytes of the file were on disk when the record was written: what is damaged below that is damage, what is
 //! damaged above it was torn by a crash.
 
 use std::time::Duration;
 
-use farm_core::id::{ContentHash, JobIndex, NodeId};
+use farm_core::id::{AppId, ContentHash, JobIndex, NodeId};
 use proto::codec::content_hash;
 
-/// This module's format. Another one is refused.
-pub(super) const VERSION: u32 = 1;
+/// The format that is written, and the newest that is read.
+pub(super) const VERSION: u32 = 2;
+/// The oldest format that is read.
+const OLDEST_VERSION: u32 = 1;
+/// The oldest format with writers.
+const SIGNED_VERSION: u32 = 2;
 /// First bytes of a journal.
 pub(super) const MAGIC: [u8; 16] = *b"gleaner-journal\n";
 /// First bytes of a record; a byte that is no text first.
@@ -62,19 +69,29 @@ pub(super) fn is_torn(bytes: &[u8], header: &[u8]) -> bool {
         && bytes.iter().zip(header).all(|(found, meant)| *found == 0 || found == meant)
 }
 
-/// Bytes of the whole header, by its first [`FIXED_HEADER_BYTES`].
-pub(super) fn header_bytes(fixed: &[u8]) -> Result<usize, HeaderFault> {
+/// What the first [`FIXED_HEADER_BYTES`] of a header say.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct Header {
+    /// Bytes of the whole header.
+    pub(super) bytes: usize,
+    /// Whether those who write say who they are.
+    pub(super) signed: bool,
+}
+
+pub(super) fn decode_fixed_header(fixed: &[u8]) -> Result<Header, HeaderFault> {
     let mut fields = Fields(fixed);
     if fields.take::<16>() != Some(MAGIC) {
         return Err(HeaderFault::NotAJournal);
     }
-    match fields.u32() {
-        Some(VERSION) => {}
+    let version = match fields.u32() {
+        Some(version @ OLDEST_VERSION..=VERSION) => version,
         Some(other) => return Err(HeaderFault::Version(other)),
         None => return Err(HeaderFault::Damaged),
-    }
+    };
     match fields.u32().map(|length| length as usize) {
-        Some(length) if length <= MAX_LABEL_BYTES => Ok(FIXED_HEADER_BYTES + length + CHECK_BYTES),
+        Some(length) if length <= MAX_LABEL_BYTES => {
+            Ok(Header { bytes: FIXED_HEADER_BYTES + length + CHECK_BYTES, signed: version >= SIGNED_VERSION })
+        }
         _ => Err(HeaderFault::Damaged),
     }
 }
@@ -86,7 +103,24 @@ pub(super) fn decode_header(bytes: &[u8]) -> Result<&str, HeaderFault> {
     std::str::from_utf8(label).map_err(|_| HeaderFault::Damaged)
 }
 
-/// What a record begins with: where it is, and how long.
+/// What a record tells of; its number is in the head.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Kind {
+    Result = 0,
+    Writer = 1,
+}
+
+impl Kind {
+    const fn numbered(number: u32) -> Option<Self> {
+        match number {
+            0 => Some(Self::Result),
+            1 => Some(Self::Writer),
+            _ => None,
+        }
+    }
+}
+
+/// What a record begins with: where it is, how long, and of which kind.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Head {
     /// Offset of its first byte.
@@ -95,17 +129,19 @@ pub(super) struct Head {
     pub(super) durable: u64,
     pub(super) payload_bytes: u64,
     pub(super) meta_bytes: u32,
+    pub(super) kind: Kind,
 }
 
 impl Head {
     pub(super) fn encode(&self) -> [u8; HEAD_BYTES] {
-        let Self { at, durable, payload_bytes, meta_bytes } = self;
+        let Self { at, durable, payload_bytes, meta_bytes, kind } = *self;
         let mut bytes = [0; HEAD_BYTES];
         bytes[..8].copy_from_slice(&MARK);
         bytes[8..16].copy_from_slice(&at.to_le_bytes());
         bytes[16..24].copy_from_slice(&durable.to_le_bytes());
         bytes[24..32].copy_from_slice(&payload_bytes.to_le_bytes());
         bytes[32..36].copy_from_slice(&meta_bytes.to_le_bytes());
+        bytes[36..40].copy_from_slice(&(kind as u32).to_le_bytes());
         let sum = check(&bytes[..HEAD_BYTES - CHECK_BYTES]);
         bytes[HEAD_BYTES - CHECK_BYTES..].copy_from_slice(&sum);
         bytes
@@ -122,6 +158,7 @@ impl Head {
             durable: fields.u64()?,
             payload_bytes: fields.u64()?,
             meta_bytes: fields.u32()?,
+            kind: fields.u32().and_then(Kind::numbered)?,
         };
         let whole = head.meta_bytes as usize <= MAX_META_BYTES && head.end().is_some();
         (head.at == at && head.durable <= at && whole).then_some(head)
@@ -147,6 +184,37 @@ impl Head {
 /// Offset in `bytes` of the first mark of a record.
 pub(super) fn find_mark(bytes: &[u8]) -> Option<usize> {
     bytes.windows(MARK.len()).position(|window| window == MARK)
+}
+
+/// What a record says.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(super) enum Record {
+    /// A result, its payload apart.
+    Result(Meta),
+    /// What follows is written by a process of this application.
+    Writer(AppId),
+}
+
+impl Record {
+    /// `None` for bytes that are no meta of such a head.
+    pub(super) fn decode(bytes: &[u8], head: &Head) -> Option<Self> {
+        match head.kind {
+            Kind::Result => Meta::decode(bytes, head.payload_bytes).map(Self::Result),
+            Kind::Writer => {
+                let mut fields = Fields(checked(bytes)?);
+                let app = AppId(fields.u64()?);
+                (fields.0.is_empty() && head.payload_bytes == 0).then_some(Self::Writer(app))
+            }
+        }
+    }
+}
+
+/// A whole record that says who writes from here on, where all bytes before it are on disk.
+pub(super) fn encode_writer(at: u64, app: AppId) -> Vec<u8> {
+    let meta = app.0.to_le_bytes();
+    let meta_bytes = u32::try_from(meta.len() + CHECK_BYTES).expect("16 bytes");
+    let head = Head { at, durable: at, payload_bytes: 0, meta_bytes, kind: Kind::Writer };
+    [&head.encode()[..], &meta, &check(&meta)].concat()
 }
 
 /// What a record says of its result.
@@ -278,7 +346,8 @@ mod tests {
             payload_bytes in 0..1_u64 << 50,
             flip in 0..8 * HEAD_BYTES,
         ) {
-            let head = Head { at, durable: durable.min(at), payload_bytes, meta_bytes: 100 };
+            let kind = if at % 2 == 0 { Kind::Result } else { Kind::Writer };
+            let head = Head { at, durable: durable.min(at), payload_bytes, meta_bytes: 100, kind };
             let bytes = head.encode();
             prop_assert_eq!(Head::decode(&bytes, at), Some(head));
             prop_assert_eq!(Head::decode(&bytes, at + 1), None, "a copy elsewhere is no record");
@@ -289,13 +358,13 @@ mod tests {
 
         #[test]
         fn any_bytes_give_an_answer(bytes in prop::collection::vec(any::<u8>(), 0..200)) {
-            let _ = (header_bytes(&bytes).is_ok(), decode_header(&bytes).is_ok(), Meta::decode(&bytes, 0));
+            let _ = (decode_fixed_header(&bytes).is_ok(), decode_header(&bytes).is_ok(), Meta::decode(&bytes, 0));
         }
 
         #[test]
         fn a_label_comes_back(label in ".{0,100}") {
             let bytes = encode_header(&label);
-            prop_assert_eq!(header_bytes(&bytes), Ok(bytes.len()));
+            prop_assert_eq!(decode_fixed_header(&bytes), Ok(Header { bytes: bytes.len(), signed: true }));
             prop_assert_eq!(decode_header(&bytes), Ok(&*label));
             prop_assert_eq!(decode_header(&bytes[..bytes.len() - 1]), Err(HeaderFault::Damaged));
         }
@@ -303,7 +372,8 @@ mod tests {
 
     #[test]
     fn what_no_file_can_hold_is_no_head() {
-        let head = Head { at: 100, durable: 0, payload_bytes: u64::MAX - 50, meta_bytes: 100 };
+        let (payload_bytes, kind) = (u64::MAX - 50, Kind::Result);
+        let head = Head { at: 100, durable: 0, payload_bytes, meta_bytes: 100, kind };
         assert_eq!(Head::decode(&head.encode(), 100), None);
         let head = Head { payload_bytes: 0, meta_bytes: u32::MAX, ..head };
         assert_eq!(Head::decode(&head.encode(), 100), None);
@@ -315,7 +385,24 @@ mod tests {
     fn headers_of_others_are_told_apart() {
         let mut other = encode_header("x");
         other[16] = 9;
-        assert_eq!(header_bytes(&other), Err(HeaderFault::Version(9)));
-        assert_eq!(header_bytes(b"v 0.1 an OBJ file, of all things"), Err(HeaderFault::NotAJournal));
+        assert_eq!(decode_fixed_header(&other), Err(HeaderFault::Version(9)));
+        other[16] = 1;
+        assert!(decode_fixed_header(&other).is_ok_and(|header| !header.signed));
+        assert_eq!(decode_fixed_header(b"v 0.1 an OBJ file, of all things"), Err(HeaderFault::NotAJournal));
+    }
+
+    #[test]
+    fn a_writer_comes_back_and_a_changed_one_does_not() {
+        let bytes = encode_writer(100, AppId(7 << 32 | 1));
+        let decode = |bytes: &[u8]| {
+            let (head, meta) = bytes.split_first_chunk()?;
+            Record::decode(meta, &Head::decode(head, 100)?)
+        };
+        assert_eq!(decode(&bytes), Some(Record::Writer(AppId(7 << 32 | 1))));
+        for at in 0..bytes.len() {
+            let mut changed = bytes.clone();
+            changed[at] ^= 1;
+            assert_eq!(decode(&changed), None, "byte {at}");
+        }
     }
 }

@@ -1,4 +1,5 @@
-//! A run's journal: the results that an application has taken, in one file, so that another process of it goes on from there.
+//! A run's journal: the results that an application has taken, in one file, so that another process of it goes on from there; and
+//! as which application the last one did so.
 //!
 //! Owns the file: who may use it, what of it counts after a crash, how it grows. Never decides which result counts, and never
 //! talks to the farm; `format` knows the bytes, `writer` the thread that appends.
@@ -18,11 +19,13 @@ use std::{
 };
 
 use bytes::Bytes;
-use farm_core::id::{ContentHash, JobIndex};
+use farm_core::id::{AppId, ContentHash, JobIndex};
 use proto::codec::content_hash;
 use thiserror::Error;
 
-use self::format::{FIXED_HEADER_BYTES, HEAD_BYTES, Head, HeaderFault, MAX_LABEL_BYTES, Meta, VERSION};
+use self::format::{
+    FIXED_HEADER_BYTES, HEAD_BYTES, Head, Header, HeaderFault, MAX_LABEL_BYTES, Meta, Record, VERSION,
+};
 pub(crate) use self::writer::{About, JournalWriter, Keep, Reports};
 use crate::job::{JobResult, split_sections};
 
@@ -47,6 +50,8 @@ pub struct Journal {
     /// Bytes of whole records; what comes next goes there. All of it is on disk.
     length: u64,
     max_bytes: u64,
+    /// Whether its format has writers.
+    signed: bool,
     records: Records,
     cut_bytes: u64,
 }
@@ -77,8 +82,8 @@ pub enum JournalError {
         /// The file.
         path: PathBuf,
     },
-    /// Written by a version that writes them otherwise.
-    #[error("journal {} is of format {found}, this program reads and writes format {VERSION}", path.display())]
+    /// Written by a later version, that writes them otherwise.
+    #[error("journal {} is of format {found}, this program reads formats up to {VERSION}", path.display())]
     Version {
         /// The file.
         path: PathBuf,
@@ -166,20 +171,21 @@ impl Journal {
             Err(TryLockError::Error(error)) => return Err(JournalError::io(&path, "locking it", error)),
         }
         let opened = begin_or_read(&file, label).map_err(|fault| fault.of(&path, label))?;
-        let (records, end, length) = match opened {
+        let (signed, records, end, length) = match opened {
             Contents::Begun { length } => {
                 // The name of a new file is safe when its folder is.
                 sync_folder(&path).map_err(|error| JournalError::io(&path, "writing its folder", error))?;
-                (Records::default(), length, length)
+                (true, Records::default(), length, length)
             }
-            Contents::Read { records, end, length } => (records, end, length),
+            Contents::Read { signed, records, end, length } => (signed, records, end, length),
         };
         if end < length {
             file.set_len(end).map_err(|error| JournalError::io(&path, "cutting off its torn end", error))?;
         }
         // What an earlier process wrote may still be in memory only.
         file.sync_all().map_err(|error| JournalError::io(&path, "writing it", error))?;
-        Ok(Self { path, file, length: end, max_bytes: DEFAULT_MAX_BYTES, records, cut_bytes: length - end })
+        let (max_bytes, cut_bytes) = (DEFAULT_MAX_BYTES, length - end);
+        Ok(Self { path, file, length: end, max_bytes, signed, records, cut_bytes })
     }
 
     /// The same with another bound on its size than 256 GiB. A run whose results do not fit ends with [`JournalError::Full`]; what
@@ -216,12 +222,13 @@ impl Journal {
 
     /// Splits it into what reads and what writes. `names` are those of the run's tasks.
     pub(crate) fn split(self, names: &[&str]) -> Result<(JournalReader, Appendix), JournalError> {
-        let Self { path, file, length, max_bytes, records, cut_bytes: _ } = self;
+        let Self { path, file, length, max_bytes, signed, records, cut_bytes: _ } = self;
         if let Some(task) = records.tasks.keys().find(|task| !names.contains(&task.as_str())) {
             return Err(JournalError::OtherTasks { task: shown(task), path });
         }
         let append = file.try_clone().map_err(|error| JournalError::io(&path, "opening it again", error))?;
-        let appendix = Appendix { path: path.clone(), file: append, length, max_bytes };
+        let writer = records.writer;
+        let appendix = Appendix { path: path.clone(), file: append, length, max_bytes, signed, writer };
         Ok((JournalReader { path, file, records }, appendix))
     }
 }
@@ -247,6 +254,35 @@ pub(crate) struct Appendix {
     file: File,
     length: u64,
     max_bytes: u64,
+    signed: bool,
+    writer: Option<AppId>,
+}
+
+impl Appendix {
+    /// As which application the last process wrote that may have added results.
+    pub(crate) const fn writer(&self) -> Option<AppId> {
+        self.writer
+    }
+
+    /// Has the journal say, on disk, that what follows is this application's.
+    ///
+    /// # Errors
+    /// The system refuses.
+    pub(crate) fn sign(&mut self, app: AppId) -> Result<(), JournalError> {
+        if !self.signed || self.writer == Some(app) {
+            return Ok(());
+        }
+        let record = format::encode_writer(self.length, app);
+        let end = self.length + record.len() as u64;
+        // Where this has no room no result has: the run ends with the first, or needs none.
+        if end > self.max_bytes {
+            return Ok(());
+        }
+        let written = self.file.write_all_at(&record, self.length).and_then(|()| self.file.sync_data());
+        written.map_err(|error| JournalError::io(&self.path, "writing it", error))?;
+        (self.length, self.writer) = (end, Some(app));
+        Ok(())
+    }
 }
 
 impl JournalReader {
@@ -284,7 +320,9 @@ impl JournalReader {
     pub(crate) fn read(&self, place: Place) -> Result<JobResult, JournalError> {
         let Place { at, program } = place;
         let read = || -> io::Result<Option<JobResult>> {
-            let Some((head, meta)) = read_record(&self.file, at, u64::MAX)? else { return Ok(None) };
+            let Some((head, Record::Result(meta))) = read_record(&self.file, at, u64::MAX)? else {
+                return Ok(None);
+            };
             let payload = read_payload(&self.file, &head)?;
             if meta.program != program || content_hash(&payload) != meta.payload {
                 return Ok(None);
@@ -317,6 +355,8 @@ struct Records {
     places: BTreeMap<RecordKey, u64>,
     /// What was written first of all.
     first: Option<RecordKey>,
+    /// Whose process wrote last.
+    writer: Option<AppId>,
 }
 
 /// What a result is found by.
@@ -328,7 +368,14 @@ struct RecordKey {
 }
 
 impl Records {
-    fn add(&mut self, at: u64, meta: Meta) {
+    fn add(&mut self, at: u64, record: Record) {
+        match record {
+            Record::Result(meta) => self.add_result(at, meta),
+            Record::Writer(app) => self.writer = Some(app),
+        }
+    }
+
+    fn add_result(&mut self, at: u64, meta: Meta) {
         let count = u32::try_from(self.tasks.len()).expect("a name takes a record, and 2^32 of them no file");
         let task = *self.tasks.entry(meta.task).or_insert(count);
         let key = RecordKey { task, program: meta.program, index: meta.index };
@@ -348,7 +395,7 @@ enum Contents {
     /// Nothing, or the beginning of this header: it has the whole header now.
     Begun { length: u64 },
     /// Records up to `end`, of a file of `length` bytes.
-    Read { records: Records, end: u64, length: u64 },
+    Read { signed: bool, records: Records, end: u64, length: u64 },
 }
 
 /// The records of a file that count.
@@ -405,7 +452,8 @@ fn begin_or_read(file: &File, label: &str) -> Result<Contents, Fault> {
         return Ok(Contents::Begun { length: header.len() as u64 });
     }
     let fixed = &beginning[..beginning.len().min(FIXED_HEADER_BYTES)];
-    let whole = format::header_bytes(fixed)? as u64;
+    let Header { bytes, signed } = format::decode_fixed_header(fixed)?;
+    let whole = bytes as u64;
     if whole > length {
         return Err(HeaderFault::Damaged.into());
     }
@@ -420,16 +468,16 @@ fn begin_or_read(file: &File, label: &str) -> Result<Contents, Fault> {
         scan = read_records(file, whole, scan.end, scan.durable)?;
     }
     let Scan { records, end, durable: _ } = scan;
-    Ok(Contents::Read { records, end, length })
+    Ok(Contents::Read { signed, records, end, length })
 }
 
 /// All records that count, of a file of which the first `known` bytes are known to have been on disk.
 fn read_records(file: &File, from: u64, length: u64, known: u64) -> Result<Scan, Fault> {
     let (mut records, mut at, mut durable) = (Records::default(), from, from);
     // Written since the last time that the disk was waited for: each may be torn.
-    let mut young: Vec<(Head, Meta)> = Vec::new();
+    let mut young: Vec<(Head, Record)> = Vec::new();
     while at < length {
-        let Some((head, meta)) = read_record(file, at, length)? else {
+        let Some((head, record)) = read_record(file, at, length)? else {
             if is_followed(file, at, length)? {
                 return Err(Fault::Damaged { at });
             }
@@ -437,28 +485,32 @@ fn read_records(file: &File, from: u64, length: u64, known: u64) -> Result<Scan,
         };
         if head.durable > durable {
             durable = head.durable;
-            for (head, meta) in young.extract_if(.., |(head, _)| head.at < durable) {
-                records.add(head.at, meta);
+            for (head, record) in young.extract_if(.., |(head, _)| head.at < durable) {
+                records.add(head.at, record);
             }
         }
         at = head.end().expect("a decoded head has an end");
-        young.push((head, meta));
+        young.push((head, record));
     }
-    for (head, meta) in young {
-        if content_hash(&read_payload(file, &head)?) != meta.payload {
+    for (head, record) in young {
+        let torn = match &record {
+            Record::Result(meta) => content_hash(&read_payload(file, &head)?) != meta.payload,
+            Record::Writer(_) => false,
+        };
+        if torn {
             at = head.at;
             if at < known {
                 return Err(Fault::Damaged { at });
             }
             break;
         }
-        records.add(head.at, meta);
+        records.add(head.at, record);
     }
     Ok(Scan { records, end: at, durable: durable.max(known) })
 }
 
 /// The record at `at` but for its payload; `None` if there is none that is whole.
-fn read_record(file: &File, at: u64, length: u64) -> io::Result<Option<(Head, Meta)>> {
+fn read_record(file: &File, at: u64, length: u64) -> io::Result<Option<(Head, Record)>> {
     if length.saturating_sub(at) < HEAD_BYTES as u64 {
         return Ok(None);
     }
@@ -469,7 +521,7 @@ fn read_record(file: &File, at: u64, length: u64) -> io::Result<Option<(Head, Me
         return Ok(None);
     }
     let meta = read_at(file, head.meta_at(), head.meta_bytes.into())?;
-    Ok(Meta::decode(&meta, head.payload_bytes).map(|meta| (head, meta)))
+    Ok(Record::decode(&meta, &head).map(|record| (head, record)))
 }
 
 fn read_payload(file: &File, head: &Head) -> io::Result<Vec<u8>> {

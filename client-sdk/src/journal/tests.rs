@@ -5,7 +5,7 @@ use std::{fs, sync::mpsc, time::Duration};
 use farm_core::id::{NodeId, TaskId};
 use tempfile::TempDir;
 
-use super::*;
+use super::{format::Kind, *};
 use crate::run::Payload;
 
 const LABEL: &str = "test, seed 7";
@@ -82,27 +82,124 @@ fn three(folder: &TempDir) -> (PathBuf, Vec<u8>, [usize; 4]) {
     let mut bytes = fs::read(&path).unwrap();
     let mut starts = vec![format::encode_header(LABEL).len(), bytes.len()];
     for index in [1, 2] {
-        let result = keep("a", index, program(index));
-        let (meta, payload) = (result.meta().encode().unwrap(), sections(index).concat());
-        let head = Head {
-            at: bytes.len() as u64,
-            durable: first,
-            payload_bytes: payload.len() as u64,
-            meta_bytes: u32::try_from(meta.len()).unwrap(),
-        };
-        bytes.extend_from_slice(&head.encode());
-        bytes.extend_from_slice(&meta);
-        bytes.extend_from_slice(&payload);
+        add_result(&mut bytes, index, first);
         starts.push(bytes.len());
     }
     (path, bytes, starts.try_into().unwrap())
 }
 
+/// Adds a result of the task `a` to a journal of which so many bytes are on disk.
+fn add_result(bytes: &mut Vec<u8>, index: u32, durable: u64) {
+    let result = keep("a", index, program(index));
+    let (meta, payload) = (result.meta().encode().unwrap(), sections(index).concat());
+    let head = Head {
+        at: bytes.len() as u64,
+        durable,
+        payload_bytes: payload.len() as u64,
+        meta_bytes: u32::try_from(meta.len()).unwrap(),
+        kind: Kind::Result,
+    };
+    bytes.extend_from_slice(&head.encode());
+    bytes.extend_from_slice(&meta);
+    bytes.extend_from_slice(&payload);
+}
+
+/// A journal whose first writer added 0, and whose second one 1 and 2 in one group. With the ends of the header and of each record,
+/// and what is there so far: results, and who wrote last.
+type Ends = Vec<(usize, u64, Option<AppId>)>;
+
+fn two_writers(folder: &TempDir) -> (PathBuf, Vec<u8>, Ends) {
+    let path = folder.path().join("writers");
+    let mut ends = vec![(format::encode_header(LABEL).len(), 0, None)];
+    let length = || usize::try_from(fs::metadata(&path).unwrap().len()).unwrap();
+    sign(&path, FIRST);
+    ends.push((length(), 0, Some(FIRST)));
+    append(&path, &[&[0]]);
+    ends.push((length(), 1, Some(FIRST)));
+    sign(&path, SECOND);
+    ends.push((length(), 1, Some(SECOND)));
+    let mut bytes = fs::read(&path).unwrap();
+    for index in [1, 2] {
+        add_result(&mut bytes, index, ends[3].0 as u64);
+        ends.push((bytes.len(), 1 + u64::from(index), Some(SECOND)));
+    }
+    (path, bytes, ends)
+}
+
+const FIRST: AppId = AppId(3 << 32 | 7);
+const SECOND: AppId = AppId(3 << 32 | 8);
+
+fn sign(path: &Path, app: AppId) {
+    Journal::open(path, LABEL).unwrap().split(&["a"]).unwrap().1.sign(app).unwrap();
+}
+
+fn writer(path: &Path) -> Result<Option<AppId>, JournalError> {
+    Ok(Journal::open(path, LABEL)?.split(&["a"])?.1.writer())
+}
+
+#[test]
+fn the_last_writer_is_known_wherever_the_end_was_torn() {
+    let folder = TempDir::new().unwrap();
+    let (path, bytes, ends) = two_writers(&folder);
+    for cut in ends[0].0..=bytes.len() {
+        fs::write(&path, &bytes[..cut]).unwrap();
+        let &(_, results, last) = ends.iter().rfind(|(end, ..)| *end <= cut).unwrap();
+        assert_eq!(writer(&path).unwrap(), last, "cut at {cut}");
+        assert_eq!(Journal::open(&path, LABEL).unwrap().results(), results, "cut at {cut}");
+    }
+    // Of the last group, which nothing says was on disk, a record is torn: the writer was on disk before it.
+    for torn in [ends[3].0, ends[4].0 - 1] {
+        let mut holed = bytes.clone();
+        holed[torn] ^= 1;
+        fs::write(&path, holed).unwrap();
+        assert_eq!((writer(&path).unwrap(), read(&path).unwrap()), (Some(SECOND), vec![0]), "byte {torn}");
+    }
+    for at in ends[2].0..ends[3].0 {
+        let mut flipped = bytes.clone();
+        flipped[at] ^= 1 << (at % 8);
+        fs::write(&path, flipped).unwrap();
+        let damaged = writer(&path).unwrap_err();
+        let begins = ends[2].0 as u64;
+        assert!(matches!(damaged, JournalError::Damaged { at_byte, .. } if at_byte == begins), "{damaged}");
+    }
+}
+
+#[test]
+fn a_writer_signs_once_and_takes_no_room_that_is_not_there() {
+    let folder = TempDir::new().unwrap();
+    let path = folder.path().join("journal");
+    sign(&path, FIRST);
+    let length = fs::metadata(&path).unwrap().len();
+    sign(&path, FIRST);
+    assert_eq!(fs::metadata(&path).unwrap().len(), length);
+    let journal = Journal::open(&path, LABEL).unwrap().with_max_bytes(length + 10);
+    journal.split(&["a"]).unwrap().1.sign(SECOND).unwrap();
+    assert_eq!((writer(&path).unwrap(), fs::metadata(&path).unwrap().len()), (Some(FIRST), length));
+}
+
+/// It has no writers, and a program that knows no others has to be able to go on with it, too.
+#[test]
+fn a_journal_of_the_first_format_goes_on_as_it_is() {
+    let folder = TempDir::new().unwrap();
+    let path = folder.path().join("journal");
+    let old = fs::read(corpus().join("valid-three")).unwrap();
+    fs::write(&path, &old).unwrap();
+    sign(&path, FIRST);
+    assert_eq!((writer(&path).unwrap(), &fs::read(&path).unwrap()), (None, &old));
+    append(&path, &[&[7]]);
+    assert_eq!(read(&path).unwrap(), [0, 1, 2, 7]);
+    assert!(fs::read(&path).unwrap().starts_with(&old));
+}
+
+fn corpus() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../fuzz/corpus/run_journal")
+}
+
 /// A golden file: another format must have another version. It is also what `tests/hostile` makes hostile journals of.
 #[test]
 fn the_format_is_that_of_the_corpus() {
-    let golden = Path::new(env!("CARGO_MANIFEST_DIR")).join("../fuzz/corpus/run_journal/valid-three");
-    let (_, bytes, _) = three(&TempDir::new().unwrap());
+    let golden = corpus().join("valid-writers");
+    let (_, bytes, _) = two_writers(&TempDir::new().unwrap());
     if std::env::var_os("FARM_BLESS").is_some() && !golden.exists() {
         fs::create_dir_all(golden.parent().unwrap()).unwrap();
         fs::write(&golden, &bytes).unwrap();

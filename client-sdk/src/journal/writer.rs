@@ -13,7 +13,7 @@ use farm_core::id::{ContentHash, JobIndex, NodeId, TaskId};
 
 use super::{
     Appendix, JournalError,
-    format::{HEAD_BYTES, Head, Meta},
+    format::{HEAD_BYTES, Head, Kind, Meta},
 };
 use crate::run::Payload;
 
@@ -111,7 +111,7 @@ impl JournalWriter {
 }
 
 fn append(appendix: Appendix, queue: &mpsc::Receiver<Keep>, mut reports: impl Reports) {
-    let Appendix { path, file, length, max_bytes } = appendix;
+    let Appendix { path, file, length, max_bytes, signed: _, writer: _ } = appendix;
     let mut tail =
         Tail { durable: length, length, max_bytes, out: BufWriter::with_capacity(BUFFER_BYTES, &file) };
     while let Ok(first) = queue.recv() {
@@ -186,6 +186,7 @@ impl Tail<'_> {
             durable: self.durable,
             payload_bytes: payload.len() as u64,
             meta_bytes: u32::try_from(meta.len()).expect("an encoded meta is bounded"),
+            kind: Kind::Result,
         };
         let end = head.end().filter(|end| *end <= self.max_bytes).ok_or(Fault::Full)?;
         let head: [u8; HEAD_BYTES] = head.encode();

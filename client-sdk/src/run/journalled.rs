@@ -39,7 +39,12 @@ impl Runner {
     pub(super) fn open_journal(&mut self, journal: Option<Journal>) -> Result<(), FarmError> {
         let Some(journal) = journal else { return Ok(()) };
         let names: Vec<&str> = self.states.iter().map(|state| &*state.name).collect();
-        let (reader, appendix) = journal.split(&names)?;
+        let (reader, mut appendix) = journal.split(&names)?;
+        // Its process is dead, or the journal would be locked: what it has at the nodes is in this run's way.
+        if let Some(predecessor) = appendix.writer().filter(|writer| *writer != self.app) {
+            self.driver.supersedes(predecessor)?;
+        }
+        appendix.sign(self.app)?;
         let reporter = Reporter { driver: self.driver.clone(), events: self.events_sender.clone() };
         let writer = JournalWriter::start(appendix, reporter)?;
         self.journal = Some(RunJournal { reader, writer });

@@ -18,7 +18,7 @@ use std::{
 use bytes::Bytes;
 use farm_core::{
     device::Requirements,
-    id::{ContentHash, JobId, JobIndex, NodeId, TaskId},
+    id::{AppId, ContentHash, JobId, JobIndex, NodeId, TaskId},
     ledger::SubmittedJob,
     message::{JobFailure, WaitReason},
     program::Content,
@@ -114,6 +114,8 @@ pub(crate) struct Run {
     pub(crate) tasks: Range<u32>,
     pub(crate) nodes: Vec<GraphNode>,
     pub(crate) window: Window,
+    /// As which application it runs.
+    pub(crate) app: AppId,
     /// Where results come from that an earlier process has taken, and where those go that this one takes.
     pub(crate) journal: Option<Journal>,
     pub(crate) store: ContentStore,
@@ -172,6 +174,7 @@ struct Runner {
     tasks: Range<u32>,
     states: Vec<TaskState>,
     window: WindowUse,
+    app: AppId,
     journal: Option<RunJournal>,
     /// Outstanding jobs whose results are in it.
     replays: VecDeque<Replay>,
@@ -209,6 +212,7 @@ impl Run {
             tasks: self.tasks,
             states: self.nodes.into_iter().map(state).collect(),
             window: WindowUse::new(self.window),
+            app: self.app,
             journal: None,
             replays: VecDeque::new(),
             data: Vec::new(),

@@ -122,6 +122,8 @@ struct FakeDriver {
     store: ContentStore,
     /// Jobs that the run says are in its journal.
     kept: usize,
+    /// Applications that it says it goes on for.
+    superseded: Vec<AppId>,
 }
 
 fn start(graph: TaskGraph, window: Window) -> FakeDriver {
@@ -129,6 +131,10 @@ fn start(graph: TaskGraph, window: Window) -> FakeDriver {
 }
 
 fn start_with(graph: TaskGraph, window: Window, journal: Option<Journal>) -> FakeDriver {
+    start_as(AppId(1), graph, window, journal)
+}
+
+fn start_as(app: AppId, graph: TaskGraph, window: Window, journal: Option<Journal>) -> FakeDriver {
     let nodes = graph.check().unwrap();
     let (driver, inputs) = DriverHandle::new();
     let (events_sender, events) = mpsc::channel();
@@ -140,6 +146,7 @@ fn start_with(graph: TaskGraph, window: Window, journal: Option<Journal>) -> Fak
         tasks,
         nodes,
         window,
+        app,
         journal,
         store: store.clone(),
         driver,
@@ -148,7 +155,8 @@ fn start_with(graph: TaskGraph, window: Window, journal: Option<Journal>) -> Fak
         events_sender: events_sender.clone(),
     };
     let run = thread::spawn(move || run.run());
-    FakeDriver { inputs, events: events_sender, run, progress: progress_receiver, store, kept: 0 }
+    let (progress, superseded) = (progress_receiver, Vec::new());
+    FakeDriver { inputs, events: events_sender, run, progress, store, kept: 0, superseded }
 }
 
 impl FakeDriver {
@@ -161,6 +169,7 @@ impl FakeDriver {
                     return Some(submission);
                 }
                 Input::Kept(jobs) => self.kept += jobs.len(),
+                Input::Supersedes(app) => self.superseded.push(app),
                 Input::RunOver { .. } => return None,
                 _ => panic!("a run submits and ends, nothing else"),
             }
@@ -416,7 +425,7 @@ fn a_complete_journal_needs_no_farm() {
 #[test]
 fn a_journal_without_room_ends_the_run() {
     let file = JournalFile::new();
-    let journal = file.open().with_max_bytes(520);
+    let journal = file.open().with_max_bytes(584);
     let mut driver = start_with(journalled_graph(&Log::default()), Window::default(), Some(journal));
     let batch = driver.batch().expect("the task has jobs");
     // One is left out: the run cannot be complete before it hears.
@@ -442,4 +451,18 @@ fn a_journal_of_another_graph_or_of_other_inputs_ends_the_run_before_it_begins()
     let error = run(TaskGraph::new().task("a", changed).task("b", noted(&log, "b", 10)).after("b", "a"));
     assert!(matches!(error, FarmError::Journal(JournalError::OtherInputs { .. })), "{error}");
     assert_eq!(*log.lock().unwrap(), ["a prepare"], "no result of the other run was taken");
+}
+
+#[test]
+fn a_run_says_whom_it_goes_on_for_before_it_asks_for_anything() {
+    let file = JournalFile::new();
+    for (app, predecessor) in [(7, None), (8, Some(7)), (8, None), (9, Some(8))] {
+        let graph = journalled_graph(&Log::default());
+        let mut run = start_as(AppId(app), graph, Window::default(), Some(file.open()));
+        run.batch().expect("jobs are left");
+        assert_eq!(run.superseded, Vec::from_iter(predecessor.map(AppId)), "{app}");
+        run.events.send(RunEvent::Ended(RunEnd::Stopped)).unwrap();
+        while run.batch().is_some() {}
+        let _ = run.end();
+    }
 }

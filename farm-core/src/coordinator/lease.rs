@@ -54,13 +54,34 @@ impl CoordinatorMachine {
         }
     }
 
-    /// An application's connection is gone: its jobs go on for the time of its lease.
+    /// An application's connection is gone: its jobs go on for the time of its lease, unless another one goes on for it.
     pub(super) fn app_away(&mut self, now: Instant, id: AppId) {
         let lease_until = now.after(Duration::from_millis(self.config.app_lease_ms));
-        if let Some(app) = self.apps.get_mut(&id) {
-            app.link = None;
-            app.lease_until = lease_until;
-            self.arm(lease_until);
+        let Some(app) = self.apps.get_mut(&id) else { return };
+        app.link = None;
+        if app.superseded_until.is_some_and(|until| now <= until) {
+            return self.app_leaves(id);
+        }
+        app.lease_until = lease_until;
+        self.arm(lease_until);
+    }
+
+    /// An application says that it goes on for another one of its project, whose process is dead: nobody waits for that one's
+    /// results. One whose connection stands keeps all it has, whatever is said of it; if its process is dead indeed the end of
+    /// its connection is on its way, or its silence will be noticed.
+    pub(super) fn supersede(&mut self, now: Instant, successor: AppId, id: AppId) {
+        if successor == id || self.projects.name_of(successor) != self.projects.name_of(id) {
+            return;
+        }
+        // Its last words may be on their way still, and its silence counts from them.
+        let noticed_by = now.after(Duration::from_millis(self.config.liveness.dead_ms).saturating_mul(2));
+        let Some(app) = self.apps.get_mut(&id) else { return };
+        match app.link {
+            Some(_) => app.superseded_until = Some(noticed_by),
+            None => {
+                tracing::info!(app = %id, %successor, "another application goes on for it");
+                self.app_leaves(id);
+            }
         }
     }
 

@@ -502,6 +502,12 @@ impl CoordinatorMachine {
         self.rearm();
     }
 
+    /// Whether an application is registered.
+    #[must_use]
+    pub fn knows_app(&self, app: AppId) -> bool {
+        self.apps.contains_key(&app)
+    }
+
     /// When [`Self::handle_timeout`] wants to be called next.
     #[must_use]
     pub const fn poll_timeout(&self) -> Option<Instant> {
@@ -529,6 +535,7 @@ impl CoordinatorMachine {
             AppToCoordinator::AlreadyDelivered(jobs) => self.already_delivered(app, &jobs),
             AppToCoordinator::Unreachable { node, session } => self.unreachable(now, app, node, session),
             AppToCoordinator::Cancel(task) => self.cancel_task(app, task),
+            AppToCoordinator::Supersede(predecessor) => self.supersede(now, app, predecessor),
             AppToCoordinator::Heartbeat { sequence, unanswered: _ } => {
                 self.tell_app(app, CoordinatorToApp::HeartbeatAck { sequence });
             }

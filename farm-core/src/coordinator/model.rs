@@ -54,6 +54,8 @@ pub(super) struct App {
     pub(super) deaf: bool,
     pub(super) last_heard: Instant,
     pub(super) lease_until: Instant,
+    /// Another application goes on for it: if its connection ends by then, it is over at once.
+    pub(super) superseded_until: Option<Instant>,
     /// Batches with jobs in `jobs`.
     pub(super) batches: BTreeMap<BatchId, Batch>,
     /// Jobs neither delivered nor failed.

@@ -243,6 +243,7 @@ impl CoordinatorMachine {
             deaf: false,
             last_heard: now,
             lease_until: now,
+            superseded_until: None,
             batches: BTreeMap::new(),
             jobs: BTreeMap::new(),
             failed: BTreeMap::new(),
@@ -265,6 +266,8 @@ impl CoordinatorMachine {
         let Some(app) = self.apps.get_mut(&id) else { return };
         app.deaf = false;
         app.last_heard = now;
+        // Whoever comes back is alive.
+        app.superseded_until = None;
         if let Some(old) = app.link.replace(link) {
             self.close(old);
         }

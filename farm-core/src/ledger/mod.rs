@@ -69,6 +69,8 @@ pub enum Event {
         /// The job.
         index: JobIndex,
     },
+    /// This application goes on for that one, whose process is dead: the coordinator is told, now or when it is back.
+    Supersedes(AppId),
     /// The coordinator said something.
     FromCoordinator(CoordinatorToApp),
     /// The connection to the coordinator is gone; the driver will try again.
@@ -228,6 +230,8 @@ pub struct Ledger {
     compare_every: Duration,
     /// Nodes with something to flush.
     dirty: BTreeSet<NodeLife>,
+    /// Applications that this one goes on for, to be flushed: no more than runs were begun since the last flush.
+    predecessors: BTreeSet<AppId>,
     /// Answers to re-plans that came too late, to be flushed.
     already_delivered: Vec<JobId>,
     counts: LedgerCounts,
@@ -256,6 +260,7 @@ impl Ledger {
             deadlines: BTreeMap::new(),
             compare_every: Liveness::default().compare_every(),
             dirty: BTreeSet::new(),
+            predecessors: BTreeSet::new(),
             already_delivered: Vec::new(),
             counts: LedgerCounts::default(),
             effects: VecDeque::new(),
@@ -289,6 +294,9 @@ impl Ledger {
             Event::FromCoordinator(message) => self.coordinator_said(now, message),
             Event::CoordinatorLost => self.coordinator_lost(),
             Event::Journalled(task) => self.journalled(task),
+            Event::Supersedes(app) => {
+                self.predecessors.insert(app);
+            }
             Event::Kept { task, index } => self.kept(JobKey { task, index }),
             Event::Submitted { task, jobs, needs } => self.submitted(task, jobs, needs),
             Event::NodeConnected { node, session } => self.node_connected(now, NodeLife { node, session }),

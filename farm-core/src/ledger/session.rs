@@ -115,6 +115,10 @@ impl Ledger {
         if !matches!(self.session, Session::Registered(_)) {
             return;
         }
+        // First: what they hold makes room for what is asked for next.
+        for app in std::mem::take(&mut self.predecessors) {
+            self.tell_coordinator(AppToCoordinator::Supersede(app));
+        }
         while !self.already_delivered.is_empty() {
             let rest =
                 self.already_delivered.split_off(self.already_delivered.len().min(MAX_ALREADY_DELIVERED));
@@ -138,6 +142,7 @@ impl Ledger {
         self.close_all_nodes();
         self.drop_open_jobs();
         self.to_request.clear();
+        self.predecessors.clear();
         self.already_delivered.clear();
         self.requested_jobs = 0;
     }

@@ -23,7 +23,7 @@ use farm_core::{
     time::Instant,
 };
 
-const APP: LinkId = LinkId(0);
+pub(crate) const APP: LinkId = LinkId(0);
 pub(crate) const MILLISECOND_NS: u64 = 1_000_000;
 
 /// A coordinator with one application and nodes of one device each unless said otherwise.
@@ -45,6 +45,8 @@ pub(crate) struct Farm {
     pub(crate) located: Vec<(u64, Option<String>)>,
     /// What is to outlive the coordinator, in order.
     pub(crate) kept: Vec<Keep>,
+    /// Nodes that were told that an application left, in order.
+    pub(crate) left: Vec<(u64, AppId)>,
     /// Why the application's batches wait, in the order that it was told.
     pub(crate) waits: Vec<WaitReason>,
     /// The jobs that were given up.
@@ -74,6 +76,7 @@ impl Farm {
             asked: Vec::new(),
             located: Vec::new(),
             kept: Vec::new(),
+            left: Vec::new(),
             waits: Vec::new(),
             given_up: Vec::new(),
             terms: BTreeMap::new(),
@@ -177,6 +180,9 @@ impl Farm {
                 Effect::ToNode { link: LinkId(1), message: CoordinatorToNode::AppsJoined(apps) } => {
                     self.announcements += 1;
                     self.terms.extend(apps);
+                }
+                Effect::ToNode { link, message: CoordinatorToNode::AppLeft { app } } => {
+                    self.left.push((link.0, app));
                 }
                 Effect::ToNode { link, message: CoordinatorToNode::SayInventory } => self.asked.push(link.0),
                 Effect::ToNode { link, message: CoordinatorToNode::Located { peer, .. } } => {

@@ -13,3 +13,4 @@ mod policies;
 mod projects;
 mod speculation;
 mod spread;
+mod succession;

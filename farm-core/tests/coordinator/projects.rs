@@ -33,7 +33,7 @@ fn total(planned: &BTreeMap<u64, Vec<JobAttempt>>) -> usize {
 }
 
 /// A further application; gives its id.
-fn joins(farm: &mut Farm, link: u64, project: &str, weight: f64) -> AppId {
+pub(crate) fn joins(farm: &mut Farm, link: u64, project: &str, weight: f64) -> AppId {
     let link = LinkId(link);
     farm.handle(Event::AppIntroduced { link, project: project.to_owned() });
     farm.handle(Event::FromApp { link, message: AppToCoordinator::Hello(AppHello { weight, ..hello() }) });

@@ -10,8 +10,8 @@ use farm_core::{
     },
     ledger::{Effect, Event, Ledger, SubmittedJob},
     message::{
-        AppHello, AppToNode, Contact, CoordinatorToApp, CostNs, DevicePlan, LatencyClass, Liveness, NodePlan,
-        NodeToApp, PROTOCOL_VERSION, Plan, Priority, ResultHeader,
+        AppHello, AppToCoordinator, AppToNode, Contact, CoordinatorToApp, CostNs, DevicePlan, LatencyClass,
+        Liveness, NodePlan, NodeToApp, PROTOCOL_VERSION, Plan, Priority, ResultHeader,
     },
     time::Instant,
 };
@@ -29,6 +29,8 @@ pub(crate) struct Application {
     pub(crate) sent: Vec<JobAttempt>,
     /// What should be at the node, as it was told.
     pub(crate) compared: Vec<farm_core::holding::Holding>,
+    /// Applications that the coordinator was told it goes on for.
+    pub(crate) superseded: Vec<AppId>,
     pub(crate) delivered: usize,
     pub(crate) dropped: usize,
     /// Times that the driver was asked to connect.
@@ -53,6 +55,7 @@ impl Application {
             cancelled: Vec::new(),
             sent: Vec::new(),
             compared: Vec::new(),
+            superseded: Vec::new(),
             delivered: 0,
             dropped: 0,
             dialled: 0,
@@ -65,14 +68,7 @@ impl Application {
             contents: Vec::new(),
             module: None,
         };
-        let welcome = CoordinatorToApp::Welcome {
-            app: AppId(1),
-            incarnation: AppIncarnation(1),
-            epoch: Epoch(1),
-            liveness: Liveness::default(),
-        };
-        app.handle(Event::CoordinatorConnected);
-        app.handle(Event::FromCoordinator(welcome));
+        app.registers();
         if journalled {
             app.handle(Event::Journalled(TaskId(0)));
         }
@@ -95,6 +91,17 @@ impl Application {
     pub(crate) fn handle(&mut self, event: Event) {
         self.ledger.handle(self.now, event);
         self.settle();
+    }
+
+    /// The coordinator is there (again).
+    pub(crate) fn registers(&mut self) {
+        self.handle(Event::CoordinatorConnected);
+        self.handle(Event::FromCoordinator(CoordinatorToApp::Welcome {
+            app: AppId(1),
+            incarnation: AppIncarnation(1),
+            epoch: Epoch(1),
+            liveness: Liveness::default(),
+        }));
     }
 
     pub(crate) fn connect(&mut self) {
@@ -153,6 +160,7 @@ impl Application {
                     self.sent.extend(tickets.into_iter().map(|ticket| ticket.job));
                 }
                 Effect::ToNode { message: AppToNode::Holding(holding), .. } => self.compared.push(holding),
+                Effect::ToCoordinator(AppToCoordinator::Supersede(app)) => self.superseded.push(app),
                 Effect::Deliver { .. } => self.delivered += 1,
                 Effect::DropPayload { .. } => self.dropped += 1,
                 Effect::Connect { .. } => self.dialled += 1,

@@ -1,6 +1,9 @@
 //! Results of a journalled run are acknowledged when they are on the application's disk, and no sooner.
 
-use farm_core::{id::TaskId, ledger::Event};
+use farm_core::{
+    id::{AppId, TaskId},
+    ledger::Event,
+};
 
 use crate::application::{Application, attempt};
 
@@ -62,4 +65,18 @@ fn the_end_of_a_task_frees_what_waits() {
     app.result(1);
     assert_eq!((app.delivered, app.dropped), (1, 1), "nobody wants it");
     assert_eq!(app.acknowledged, [attempt(0), attempt(1)]);
+}
+
+#[test]
+fn the_coordinator_hears_once_whom_the_application_goes_on_for() {
+    let mut app = Application::new(true);
+    app.handle(Event::Supersedes(AppId(7)));
+    assert_eq!(app.superseded, [AppId(7)]);
+    app.handle(Event::CoordinatorLost);
+    for predecessor in [8, 8] {
+        app.handle(Event::Supersedes(AppId(predecessor)));
+    }
+    assert_eq!(app.superseded, [AppId(7)], "nobody would hear it");
+    app.registers();
+    assert_eq!(app.superseded, [AppId(7), AppId(8)]);
 }

@@ -1223,7 +1223,7 @@ pub mod admin_server {
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct AppToCoordinator {
     /// One of these.
-    #[prost(oneof = "app_to_coordinator::Message", tags = "1, 2, 3, 4, 5, 6, 7")]
+    #[prost(oneof = "app_to_coordinator::Message", tags = "1, 2, 3, 4, 5, 6, 7, 8")]
     pub message: ::core::option::Option<app_to_coordinator::Message>,
 }
 /// Nested message and enum types in `AppToCoordinator`.
@@ -1252,6 +1252,9 @@ pub mod app_to_coordinator {
         /// No more jobs will come.
         #[prost(message, tag = "7")]
         Goodbye(super::Nothing),
+        /// An application whose process is dead, and whose work this one goes on with, need not be waited for.
+        #[prost(message, tag = "8")]
+        Supersede(super::Supersede),
     }
 }
 /// An application's first message.
@@ -1349,6 +1352,13 @@ pub struct CancelTask {
     /// Which.
     #[prost(uint32, tag = "1")]
     pub task: u32,
+}
+/// The application that the sender goes on for.
+#[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct Supersede {
+    /// Which.
+    #[prost(uint64, tag = "1")]
+    pub app: u64,
 }
 /// Alive.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]

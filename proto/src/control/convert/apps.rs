@@ -26,6 +26,7 @@ impl From<AppToCoordinator> for v1::AppToCoordinator {
                 Message::Unreachable(v1::Unreachable { node: node.0, session: session.0 })
             }
             AppToCoordinator::Cancel(task) => Message::Cancel(v1::CancelTask { task: task.0 }),
+            AppToCoordinator::Supersede(app) => Message::Supersede(v1::Supersede { app: app.0 }),
             AppToCoordinator::Heartbeat { sequence, unanswered } => {
                 Message::Heartbeat(v1::AppHeartbeat { sequence, unanswered })
             }
@@ -48,6 +49,7 @@ impl TryFrom<v1::AppToCoordinator> for AppToCoordinator {
                 Self::Unreachable { node: NodeId(node), session: NodeSession(session) }
             }
             Message::Cancel(v1::CancelTask { task }) => Self::Cancel(TaskId(task)),
+            Message::Supersede(v1::Supersede { app }) => Self::Supersede(AppId(app)),
             Message::Heartbeat(v1::AppHeartbeat { sequence, unanswered }) => {
                 Self::Heartbeat { sequence, unanswered }
             }
