@@ -189,7 +189,9 @@ fn an_interrupted_render_saves_a_partial_image_and_says_so() {
     let scene = cornell(&folder);
     let farm = Farm::with_cpu_workers(1);
     let image = folder.path().join("partial.exr");
-    let mut render = start_render(&farm, &scene, &image);
+    let finished = folder.path().join("finished.png");
+    fs::write(&finished, "of an earlier render").expect("a file");
+    let mut render = start_render_with(&farm, &scene, &image, &["-o", &finished.display().to_string()]);
     // Past the light paths, which alone are no picture: some of the 64 jobs are tiles by now.
     wait_until_jobs_done(&mut render, 24);
     render.signal(Signal::Int);
@@ -197,6 +199,8 @@ fn an_interrupted_render_saves_a_partial_image_and_says_so() {
     assert_eq!(status.code(), Some(1), "an incomplete image is not a success; stderr:\n{stderr}");
     assert!(stderr.contains("partial"), "stderr does not say that the image is partial:\n{stderr}");
     assert!(fs::metadata(&image).is_ok_and(|file| file.len() > 0), "no partial image was saved");
+    assert_eq!(fs::read(&finished).expect("it stays"), b"of an earlier render");
+    assert!(folder.path().join("finished.partial.png").exists(), "stderr:\n{stderr}");
 }
 
 #[test]

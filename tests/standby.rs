@@ -38,6 +38,12 @@ fn finish(render: Process, image: &Path) -> Vec<u8> {
 fn s07_a_standby_leads_when_the_leader_is_stopped() {
     let folder = tempfile::tempdir().unwrap();
     let state = folder.path().join("state");
+    let anywhere = ["--listen", "127.0.0.1:0", "--http", "127.0.0.1:0", "--standby", "--state"];
+    let unmounted = Process::start("farm-coordinator", anywhere.iter().copied().chain(state.to_str()));
+    let (status, stderr) = unmounted.finish();
+    assert_eq!(status.code(), Some(1), "{stderr}");
+    assert!(stderr.contains("state directory") && stderr.contains("No such file"), "{stderr}");
+    fs::create_dir(&state).unwrap();
     let scene = folder.path().join("cornell").display().to_string();
     assert!(farmctl(["scene", "cornell-box", &scene]).status.success());
     let (first_address, second_address) = (free_address(), free_address());

@@ -1,9 +1,9 @@
 //! Who leads a farm whose coordinators share a state directory, and when a standby takes over (ADR 20).
 //!
-//! Terms are files, `leader-N`. Who makes the next one leads, and nobody makes one twice. A leader writes a new beat into its own
-//! every heartbeat. A standby takes over when the beat stands still for as long as a node may be silent, or at once where the leader was a process of
-//! this system that has let go of its lock. A leader that has not written its beat for three quarters of that time commits
-//! nothing any more, and one that sees a later term ends.
+//! Terms are files, `leader-N`, and each has a control store of its own. Who makes the next one leads. A leader writes a new
+//! beat into its own every heartbeat. A standby takes over when the beat stands still for as long as a node may be silent, or at
+//! once where the leader was a process of this system that has let go of its lock. A leader that has not written its beat for three
+//! quarters of that time commits nothing any more, and one that sees a later term ends.
 
 use std::{
     fs::{self, File, OpenOptions},
@@ -11,7 +11,10 @@ use std::{
     os::unix::fs::{FileExt as _, OpenOptionsExt as _},
     path::{Path, PathBuf},
     process,
-    sync::{Arc, Mutex, PoisonError, Weak},
+    sync::{
+        Arc, Mutex, OnceLock, PoisonError, Weak,
+        atomic::{AtomicBool, Ordering},
+    },
     thread,
     time::{Duration, Instant},
 };
@@ -31,7 +34,16 @@ const LOOK: Duration = Duration::from_millis(200);
 const BOOT_FILE: &str = "/proc/sys/kernel/random/boot_id";
 const HOST_FILE: &str = "/proc/sys/kernel/hostname";
 
-/// One term of leading a farm; over when this is dropped.
+/// What a standby found: the last term, and nobody who leads by it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Vacancy {
+    /// The last term; 0: there was none.
+    pub term: u64,
+    /// Its leader is silent, and may have the control store open still.
+    pub silent: bool,
+}
+
+/// One term of leading a farm. Over when this is dropped; one that never served is taken back then.
 #[derive(Debug)]
 pub(crate) struct Lead {
     directory: PathBuf,
@@ -43,6 +55,9 @@ pub(crate) struct Lead {
     renewed: Mutex<Instant>,
     /// Whether there is a later term.
     over: watch::Sender<bool>,
+    serves: AtomicBool,
+    /// Its control store, if that is a copy of the one of a leader that may go on.
+    copy: OnceLock<PathBuf>,
 }
 
 impl Lead {
@@ -66,24 +81,49 @@ impl Lead {
             io::ErrorKind::AlreadyExists => StartError::Outrun,
             _ => store::fault(&path, &error),
         })?;
-        file.lock().map_err(|error| store::fault(&path, &error))?;
         let (over, _) = watch::channel(false);
-        let renewed = Mutex::new(Instant::now());
-        let lead = Arc::new(Self { directory: directory.to_owned(), term, file, liveness, renewed, over });
+        // From here on what fails takes the term back.
+        let lead = Arc::new(Self {
+            directory: directory.to_owned(),
+            term,
+            file,
+            liveness,
+            renewed: Mutex::new(Instant::now()),
+            over,
+            serves: AtomicBool::new(false),
+            copy: OnceLock::new(),
+        });
+        lead.file.lock().map_err(|error| store::fault(&path, &error))?;
         lead.write_beat(0).map_err(|error| store::fault(&path, &error))?;
+        // A later leader has removed the file of this term, which was another's.
+        if lead.is_over().map_err(fault)? {
+            return Err(StartError::Outrun);
+        }
         let beating = Arc::downgrade(&lead);
         thread::Builder::new().name("lead".to_owned()).spawn(move || beat(&beating)).map_err(fault)?;
         Ok(lead)
     }
 
-    /// Removes the files of earlier terms.
-    pub(crate) fn forget_earlier(&self) {
+    pub(crate) const fn term(&self) -> u64 {
+        self.term
+    }
+
+    /// The control store of this term is a copy, or will be.
+    pub(crate) fn copies_to(&self, path: &Path) {
+        // There is one.
+        let _ = self.copy.set(path.to_owned());
+    }
+
+    /// The coordinator serves: what is left of earlier terms goes.
+    pub(crate) fn serves(&self) {
+        self.serves.store(true, Ordering::Relaxed);
         for term in terms(&self.directory).unwrap_or_default() {
             if term < self.term {
                 // One that stays is looked at by nobody.
                 let _ = fs::remove_file(path(&self.directory, term));
             }
         }
+        store::forget_before(&self.directory, self.term);
     }
 
     /// Whether what is committed now is what a successor finds.
@@ -127,6 +167,18 @@ impl Lead {
     }
 }
 
+impl Drop for Lead {
+    fn drop(&mut self) {
+        if !*self.serves.get_mut() {
+            // A leader that was only silent goes on with what it has, if it has not seen this.
+            if let Some(copy) = self.copy.get() {
+                let _ = fs::remove_file(copy);
+            }
+            let _ = fs::remove_file(path(&self.directory, self.term));
+        }
+    }
+}
+
 /// Writes beats until the term is over or nobody leads by it any more.
 fn beat(lead: &Weak<Lead>) {
     let mut failing = false;
@@ -157,18 +209,18 @@ fn beat(lead: &Weak<Lead>) {
     }
 }
 
-/// Waits until nobody leads, and gives the term that is over, 0 if there never was one. Says in the log who is waited for.
+/// Waits until nobody leads. Says in the log who is waited for.
 ///
 /// # Errors
-/// The directory cannot be used.
-pub async fn stand_by(directory: &Path, liveness: Liveness) -> Result<u64, StartError> {
+/// The directory cannot be used, or is not there: on a disk that is not mounted, another farm would begin.
+pub async fn stand_by(directory: &Path, liveness: Liveness) -> Result<Vacancy, StartError> {
     let mut watch = Watch { directory: directory.to_owned(), own_dead_ms: liveness.dead_ms, seen: None };
     loop {
         let looked = tokio::task::spawn_blocking(move || (watch.look(), watch)).await;
         let look;
         (look, watch) = looked.map_err(|error| store::fault(directory, &error))?;
         match look.map_err(|error| store::fault(directory, &error))? {
-            Look::Free(term) => return Ok(term),
+            Look::Free(vacancy) => return Ok(vacancy),
             Look::Led => tokio::time::sleep(LOOK).await,
         }
     }
@@ -176,7 +228,7 @@ pub async fn stand_by(directory: &Path, liveness: Liveness) -> Result<u64, Start
 
 enum Look {
     Led,
-    Free(u64),
+    Free(Vacancy),
 }
 
 /// What a standby has seen of the leader.
@@ -194,10 +246,9 @@ struct Seen {
 
 impl Watch {
     fn look(&mut self) -> io::Result<Look> {
-        fs::create_dir_all(&self.directory)?;
         let term = latest(&self.directory)?;
         if term == 0 {
-            return Ok(Look::Free(0));
+            return Ok(Look::Free(Vacancy { term, silent: false }));
         }
         let file = match File::open(path(&self.directory, term)) {
             Ok(file) => file,
@@ -226,12 +277,11 @@ impl Watch {
         let here =
             content.is_some_and(|content| !content.boot.is_empty() && content.boot == line_of(BOOT_FILE));
         if here && file.try_lock_shared().is_ok() {
-            tracing::warn!(term, "the leader's process has ended: taking over");
-            return Ok(Look::Free(term));
+            return Ok(Look::Free(Vacancy { term, silent: false }));
         }
         if silent >= Duration::from_millis(dead_ms) {
-            tracing::warn!(term, ?silent, "the leader is silent: taking over");
-            return Ok(Look::Free(term));
+            tracing::warn!(term, ?silent, "the leader is silent");
+            return Ok(Look::Free(Vacancy { term, silent: true }));
         }
         Ok(Look::Led)
     }
@@ -302,24 +352,43 @@ mod tests {
     #[tokio::test]
     async fn a_standby_waits_for_the_leader_and_only_one_follows_it() {
         let directory = tempfile::tempdir().unwrap();
-        assert_eq!(stand_by(directory.path(), soon()).await.unwrap(), 0, "nobody ever led");
+        assert_eq!(stand_by(directory.path(), soon()).await.unwrap(), Vacancy { term: 0, silent: false });
         let first = Lead::take(directory.path(), Some(0), soon()).unwrap();
         assert!(matches!(Lead::take(directory.path(), Some(0), soon()), Err(StartError::Outrun)));
         let waiting = stand_by(directory.path(), soon());
         tokio::pin!(waiting);
         let early = tokio::time::timeout(Duration::from_millis(600), &mut waiting).await;
         assert!(early.is_err(), "three times the silence that counts: it beats");
+        first.serves();
         drop(first);
-        let term = waiting.await.unwrap();
-        assert_eq!(term, 1);
-        let second = Lead::take(directory.path(), Some(term), soon()).unwrap();
+        let vacancy = waiting.await.unwrap();
+        assert_eq!(vacancy, Vacancy { term: 1, silent: false });
+        let second = Lead::take(directory.path(), Some(1), soon()).unwrap();
         assert!(
-            matches!(Lead::take(directory.path(), Some(term), soon()), Err(StartError::Outrun)),
+            matches!(Lead::take(directory.path(), Some(1), soon()), Err(StartError::Outrun)),
             "one follows"
         );
-        second.forget_earlier();
+        second.serves();
         assert_eq!(terms(directory.path()).unwrap(), [2]);
         second.holds().unwrap();
+    }
+
+    #[test]
+    fn a_term_that_never_served_is_taken_back_and_a_late_one_is_none() {
+        let directory = tempfile::tempdir().unwrap();
+        let first = Lead::take(directory.path(), None, soon()).unwrap();
+        drop(Lead::take(directory.path(), Some(1), soon()).unwrap());
+        assert_eq!(terms(directory.path()).unwrap(), [1]);
+        first.holds().unwrap();
+        let second = Lead::take(directory.path(), Some(1), soon()).unwrap();
+        let third = Lead::take(directory.path(), Some(2), soon()).unwrap();
+        third.serves();
+        // Somebody who saw the first one end, and was stopped until now.
+        assert!(matches!(Lead::take(directory.path(), Some(1), soon()), Err(StartError::Outrun)));
+        assert_eq!(terms(directory.path()).unwrap(), [3]);
+        third.holds().unwrap();
+        drop(second);
+        assert_eq!(terms(directory.path()).unwrap(), [3], "it takes nothing of others back");
     }
 
     #[tokio::test]
@@ -353,11 +422,12 @@ mod tests {
         };
         let file = path(directory.path(), 3);
         fs::write(&file, content.to_text()).unwrap();
+        let silent = Vacancy { term: 3, silent: true };
         let began = Instant::now();
-        assert_eq!(stand_by(directory.path(), soon()).await.unwrap(), 3);
+        assert_eq!(stand_by(directory.path(), soon()).await.unwrap(), silent);
         assert!(began.elapsed() >= Duration::from_millis(400), "nobody holds its lock, which says nothing");
         // A garbled one counts as silent, too.
         fs::write(&file, "\0\u{1}").unwrap();
-        assert_eq!(stand_by(directory.path(), soon()).await.unwrap(), 3);
+        assert_eq!(stand_by(directory.path(), soon()).await.unwrap(), silent);
     }
 }

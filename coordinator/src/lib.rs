@@ -46,7 +46,7 @@ use self::{
     store::{Store, epoch_by_the_clock},
 };
 pub use self::{
-    lead::stand_by,
+    lead::{Vacancy, stand_by},
     security::{AUTHORITY_FILE, initialise},
 };
 
@@ -62,9 +62,8 @@ pub struct CoordinatorOptions {
     pub http: SocketAddr,
     /// Where the epoch and members are kept; `None`: nowhere, the epoch is the time of the start.
     pub state: Option<PathBuf>,
-    /// The term that this coordinator's is to follow, as [`stand_by`] gave it: the leader's process may still have the state
-    /// directory open. `None`: no coordinator uses the directory, or the start fails.
-    pub predecessor: Option<u64>,
+    /// What [`stand_by`] found, for a coordinator that takes over. `None`: nobody uses the state directory, or the start fails.
+    pub vacancy: Option<Vacancy>,
     /// Whether members of the farm alone are let in, by the authority in the state directory.
     pub secured: bool,
     /// Whether everyone is let in though the state directory knows of members.
@@ -83,7 +82,7 @@ impl Default for CoordinatorOptions {
             listen: SocketAddr::from(([127, 0, 0, 1], 7700)),
             http: SocketAddr::from(([127, 0, 0, 1], 7701)),
             state: None,
-            predecessor: None,
+            vacancy: None,
             secured: false,
             insecure: false,
             liveness: Liveness::default(),
@@ -125,6 +124,12 @@ pub enum StartError {
         path: PathBuf,
         /// Why not.
         reason: String,
+    },
+    /// Another coordinator has the state directory open.
+    #[error("state directory {path}: another coordinator uses it (--standby waits for it)")]
+    InUse {
+        /// Which.
+        path: PathBuf,
     },
     /// Another coordinator took the lead that this one was about to take. It may stand by again.
     #[error("another coordinator leads now")]
@@ -290,6 +295,9 @@ pub async fn start(options: CoordinatorOptions) -> Result<CoordinatorHandle, Sta
         tokio::spawn(Owner::new(machine, plugins, keeper, gate.clone()).run(commands, owner_stops));
     let grpc_task = tokio::spawn(serve_grpc(incoming, owner.clone(), gate, servers_stop.clone()));
     let http_task = tokio::spawn(serve_http(http, owner.clone(), servers_stop));
+    if let Some(lead) = store.as_ref().and_then(|store| store.lead()) {
+        lead.serves();
+    }
     tracing::info!(%epoch, grpc = %grpc_addr, http = %http_addr, secured = options.secured, "coordinator started");
     tasks.splice(0..0, [owner_task, grpc_task, http_task]);
     Ok(CoordinatorHandle { owner, grpc_addr, http_addr, stop_owner, stop_servers, tasks, store, renewal })
@@ -297,20 +305,25 @@ pub async fn start(options: CoordinatorOptions) -> Result<CoordinatorHandle, Sta
 
 /// Opens the state directory as the one coordinator that leads by it.
 fn lead_by(directory: &Path, options: &CoordinatorOptions) -> Result<Store, StartError> {
-    let take = || Lead::take(directory, options.predecessor, options.liveness);
-    let (store, lead) = if let Some(predecessor) = options.predecessor {
-        let lead = take()?;
-        if predecessor > 0 {
-            // It may hold the lock, stopped as it is.
-            Store::copy_aside(directory)?;
+    let take = |predecessor| Lead::take(directory, predecessor, options.liveness);
+    match options.vacancy {
+        Some(Vacancy { term, silent: true }) => Store::copied_by(directory, take(Some(term))?),
+        vacancy => {
+            // Its lock says that nobody leads.
+            let store = Store::open(directory)?;
+            store.led_by(directory, take(vacancy.map(|vacancy| vacancy.term))?)
         }
-        (Store::open(directory)?, lead)
-    } else {
-        // Its lock says that nobody leads.
-        (Store::open(directory)?, take()?)
-    };
-    lead.forget_earlier();
-    Ok(store.led_by(lead))
+    }
+}
+
+/// Whether a coordinator with these options could listen, as a standby will have to.
+///
+/// # Errors
+/// An address cannot be had.
+pub async fn check_addresses(options: &CoordinatorOptions) -> Result<(), StartError> {
+    listen("gRPC", options.listen).await?;
+    listen("HTTP", options.http).await?;
+    Ok(())
 }
 
 async fn listen(what: &'static str, address: SocketAddr) -> Result<(TcpListener, SocketAddr), StartError> {

@@ -2,7 +2,7 @@
 
 mod settings;
 
-use std::{io::Write as _, process::ExitCode};
+use std::{io::Write as _, process::ExitCode, time::Duration};
 
 use anyhow::Context as _;
 use clap::Parser as _;
@@ -14,6 +14,8 @@ use self::settings::{Arguments, Role, Settings};
 
 /// Something failed.
 const EXIT_FAILED: u8 = 1;
+/// Pause of a standby that was not the first.
+const NEXT_LOOK: Duration = Duration::from_millis(500);
 /// The command line or the settings are wrong.
 const EXIT_USAGE: u8 = 2;
 
@@ -87,15 +89,21 @@ async fn run(Settings { options, standby }: Settings) -> anyhow::Result<()> {
 async fn start(mut options: CoordinatorOptions, standby: bool) -> anyhow::Result<CoordinatorHandle> {
     let directory = options.state.clone().filter(|_| standby);
     if directory.is_some() {
+        // Not on the day when it counts: the leader may be on this machine, and have them.
+        coordinator::check_addresses(&options).await?;
         writeln!(std::io::stdout(), r#"{{"event":"standby"}}"#).context("cannot write to stdout")?;
     }
     loop {
         if let Some(directory) = &directory {
-            options.predecessor = Some(coordinator::stand_by(directory, options.liveness).await?);
+            options.vacancy = Some(coordinator::stand_by(directory, options.liveness).await?);
+            // It may have been secured meanwhile.
+            options.secured = !options.insecure && settings::is_secured(directory);
         }
         match coordinator::start(options.clone()).await {
-            // Another standby was faster.
-            Err(StartError::Outrun) if standby => {}
+            // Another standby was faster, or a coordinator that knows of no standbys is there.
+            Err(StartError::Outrun | StartError::InUse { .. }) if standby => {
+                tokio::time::sleep(NEXT_LOOK).await
+            }
             started => return Ok(started?),
         }
     }

@@ -314,7 +314,9 @@ impl Owner {
 /// Names the contents of a member's jobs as nodes do.
 fn in_scope(peer: &Peer<CoordinatorToApp>, mut message: AppToCoordinator) -> AppToCoordinator {
     if let (Some(_), AppToCoordinator::Plan(request)) = (&peer.member, &mut message) {
-        Scope::of(&peer.project).name_all(&mut request.contents);
+        let scope = Scope::of(&peer.project);
+        scope.name_all(&mut request.contents);
+        request.module = request.module.map(|module| scope.name(module));
     }
     message
 }

@@ -163,17 +163,20 @@ pub(crate) fn settings(arguments: Arguments) -> anyhow::Result<Settings> {
     let options = CoordinatorOptions {
         listen,
         http,
-        // One that is there and cannot be read is an error later, not a farm without members.
-        secured: !insecure
-            && state.as_ref().is_some_and(|state| state.join(AUTHORITY_FILE).symlink_metadata().is_ok()),
+        secured: !insecure && state.as_deref().is_some_and(is_secured),
         insecure,
         state,
-        predecessor: None,
+        vacancy: None,
         liveness: liveness(arguments.liveness, &file.liveness)?,
         app_lease_ms: file.app_lease_ms.unwrap_or(defaults.app_lease_ms),
         plugins: plugins.map(hosted_here).transpose()?,
     };
     Ok(Settings { options, standby })
+}
+
+/// Whether a farm's authority is there. One that cannot be read is an error later, not a farm without members.
+pub(crate) fn is_secured(state: &Path) -> bool {
+    state.join(AUTHORITY_FILE).symlink_metadata().is_ok()
 }
 
 /// Plug-ins run in further processes of this executable.

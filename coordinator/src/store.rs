@@ -31,10 +31,12 @@ use self::{
 };
 use crate::{StartError, lead::Lead};
 
-/// The database in the state directory.
+/// The database in a state directory by which nobody has led yet; later ones have the term of their leader in the name.
 const FILE: &str = "control.redb";
-/// What is to take its place.
-const COPY: &str = "control.redb.copy";
+/// How those are named, before and after the term.
+const TERM_FILE: (&str, &str) = ("control-", ".redb");
+/// The ending of one that is not whole yet.
+const COPY: &str = "copy";
 /// What it keeps in memory, in bytes: it is read at joins and new sessions.
 const CACHE_BYTES: usize = 1 << 20;
 /// Where versions before the database kept the epoch.
@@ -122,10 +124,17 @@ pub(crate) struct Store {
 }
 
 impl Store {
-    /// Makes the directory if it is not there; refuses one that another coordinator uses.
+    /// Opens the latest one; makes the directory and the database if they are not there. Refuses what another coordinator uses.
     pub(crate) fn open(directory: &Path) -> Result<Self, StartError> {
         fs::create_dir_all(directory).map_err(|error| fault(directory, &error))?;
-        let path = directory.join(FILE);
+        let latest = || latest_term(directory).map_err(|error| fault(directory, &error));
+        let term = latest()?;
+        let store = Self::open_at(directory, directory.join(file_of(term)))?;
+        // Somebody who leads since we looked has moved it, and we have made another one.
+        if latest()? == term { Ok(store) } else { Err(StartError::InUse { path: directory.to_owned() }) }
+    }
+
+    fn open_at(directory: &Path, path: PathBuf) -> Result<Self, StartError> {
         // The database asserts, deep inside, what its file's header says: on a file that was cut or changed it panics.
         let opened = catch_unwind(|| Self::open_database(directory, &path));
         let database = opened.unwrap_or_else(|panic| Err(fault(&path, &damage(panic.as_ref()))))?;
@@ -134,26 +143,36 @@ impl Store {
         Ok(store)
     }
 
-    /// Puts a copy in the place of the database that a predecessor may have open: what it still writes reaches nobody. It
-    /// commits nothing that it says it did while this is done (`Lead::holds`).
-    pub(crate) fn copy_aside(directory: &Path) -> Result<(), StartError> {
-        let (path, copy) = (directory.join(FILE), directory.join(COPY));
-        let copied = || {
-            match fs::copy(&path, &copy) {
-                // It did not come to make one.
-                Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(()),
-                copied => copied?,
-            };
-            fs::File::open(&copy)?.sync_all()?;
-            fs::rename(&copy, &path)?;
-            fs::File::open(directory)?.sync_all()
-        };
-        copied().map_err(|error: io::Error| fault(&path, &error))
+    /// Makes it the one of a term, which is later than all others: nobody else has it open.
+    pub(crate) fn led_by(mut self, directory: &Path, lead: Arc<Lead>) -> Result<Self, StartError> {
+        let path = directory.join(file_of(lead.term()));
+        let moved = fs::rename(&self.path, &path).and_then(|()| fs::File::open(directory)?.sync_all());
+        moved.map_err(|error| fault(&self.path, &error))?;
+        (self.path, self.lead) = (path, Some(lead));
+        Ok(self)
     }
 
-    /// From now on it is written as long as `lead` holds.
-    pub(crate) fn led_by(self, lead: Arc<Lead>) -> Self {
-        Self { lead: Some(lead), ..self }
+    /// Opens a copy of the latest one, as that of a term: a predecessor may have the other open, and what it still writes there
+    /// reaches nobody. It commits nothing that it says it did from when the term was taken (`Lead::holds`).
+    pub(crate) fn copied_by(directory: &Path, lead: Arc<Lead>) -> Result<Self, StartError> {
+        let path = directory.join(file_of(lead.term()));
+        let copy = path.with_extension(COPY);
+        lead.copies_to(&path);
+        let copied = || -> io::Result<()> {
+            let source = directory.join(file_of(latest_term(directory)?));
+            if source.try_exists()? {
+                fs::copy(&source, &copy)?;
+                fs::File::open(&copy)?.sync_all()?;
+                fs::rename(&copy, &path)?;
+            }
+            fs::File::open(directory)?.sync_all()
+        };
+        if let Err(error) = copied() {
+            // What is not there is as good as removed.
+            let _ = fs::remove_file(&copy);
+            return Err(fault(&path, &error));
+        }
+        Ok(Self { lead: Some(lead), ..Self::open_at(directory, path)? })
     }
 
     pub(crate) const fn lead(&self) -> Option<&Arc<Lead>> {
@@ -164,7 +183,7 @@ impl Store {
     fn open_database(directory: &Path, path: &Path) -> Result<Database, StartError> {
         let opened = Database::builder().set_cache_size(CACHE_BYTES).create(path);
         let mut database = opened.map_err(|error| match error {
-            DatabaseError::DatabaseAlreadyOpen => fault(directory, &"another coordinator uses it"),
+            DatabaseError::DatabaseAlreadyOpen => StartError::InUse { path: directory.to_owned() },
             error => fault(path, &error),
         })?;
         let before = everything(&database);
@@ -516,6 +535,42 @@ fn everything(database: &Database) -> Result<Vec<Entry>, redb::Error> {
     Ok(entries)
 }
 
+/// The database of a term; 0: before the first.
+fn file_of(term: u64) -> String {
+    let (before, after) = TERM_FILE;
+    if term == 0 { FILE.to_owned() } else { format!("{before}{term}{after}") }
+}
+
+/// The term of a database's file.
+fn term_of(name: &str) -> Option<u64> {
+    let (before, after) = TERM_FILE;
+    let term: u64 = name.strip_prefix(before)?.strip_suffix(after)?.parse().ok()?;
+    // Another spelling of a number is not ours.
+    (file_of(term) == name).then_some(term)
+}
+
+/// The term of the latest database.
+fn latest_term(directory: &Path) -> io::Result<u64> {
+    let mut latest = 0;
+    for entry in fs::read_dir(directory)? {
+        latest = latest.max(entry?.file_name().to_str().and_then(term_of).unwrap_or(0));
+    }
+    Ok(latest)
+}
+
+/// Removes the databases of terms before this one; what stays is looked at by nobody.
+pub(crate) fn forget_before(directory: &Path, term: u64) {
+    let Ok(entries) = fs::read_dir(directory) else { return };
+    for name in entries.flatten().map(|entry| entry.file_name()) {
+        let Some(name) = name.to_str() else { continue };
+        let whole = name.strip_suffix(COPY).and_then(|name| name.strip_suffix('.'));
+        let of = whole.map_or_else(|| term_of(name), |name| term_of(&format!("{name}{}", TERM_FILE.1)));
+        if of.is_some_and(|of| of < term) {
+            let _ = fs::remove_file(directory.join(name));
+        }
+    }
+}
+
 fn is_operator(uri: &str) -> bool {
     uri.parse().is_ok_and(|principal: Principal| principal.role == Role::Operator)
 }
@@ -563,6 +618,7 @@ pub(crate) fn fault(path: &Path, reason: &dyn ToString) -> StartError {
 mod tests {
     use std::time::Duration;
 
+    use farm_core::message::Liveness;
     use proto::trust::{Authority, NewKey};
 
     use super::*;
@@ -579,6 +635,56 @@ mod tests {
         failed.unwrap_err();
         assert!(store.database.read().unwrap().is_none(), "it is not used as it is");
         assert_eq!(store.begin_epoch().unwrap().0, first.0 + 1, "what was committed is there");
+    }
+
+    fn lead(directory: &Path, predecessor: Option<u64>) -> Arc<Lead> {
+        Lead::take(directory, predecessor, Liveness::default()).unwrap()
+    }
+
+    #[test]
+    fn a_standby_that_was_stopped_in_its_takeover_changes_nothing_of_the_one_after_it() {
+        let directory = tempfile::tempdir().unwrap();
+        let directory = directory.path();
+        let first = Store::open(directory).unwrap().led_by(directory, lead(directory, None)).unwrap();
+        first.lead().unwrap().serves();
+        assert_eq!(first.begin_epoch().unwrap(), Epoch(1));
+        let stopped = lead(directory, Some(1));
+        let third = Store::copied_by(directory, lead(directory, Some(2))).unwrap();
+        third.lead().unwrap().serves();
+        assert_eq!(third.begin_epoch().unwrap(), Epoch(2));
+        // It goes on.
+        if let Ok(late) = Store::copied_by(directory, stopped) {
+            assert!(late.begin_epoch().unwrap_err().to_string().contains("another coordinator"));
+        }
+        assert_eq!(third.begin_epoch().unwrap(), Epoch(3));
+        assert!(first.begin_epoch().is_err());
+        drop((first, third));
+        assert_eq!(Store::open(directory).unwrap().begin_epoch().unwrap(), Epoch(4));
+        let left: Vec<_> = fs::read_dir(directory).unwrap().map(|entry| entry.unwrap().file_name()).collect();
+        assert_eq!(left.len(), 2, "the last term and its database: {left:?}");
+    }
+
+    #[test]
+    fn a_takeover_that_fails_leaves_the_leader_its_lead() {
+        let directory = tempfile::tempdir().unwrap();
+        let directory = directory.path();
+        let first = Store::open(directory).unwrap().led_by(directory, lead(directory, None)).unwrap();
+        first.lead().unwrap().serves();
+        let second = Store::copied_by(directory, lead(directory, Some(1))).unwrap();
+        assert_eq!(second.begin_epoch().unwrap(), Epoch(1));
+        drop(second);
+        assert_eq!(first.begin_epoch().unwrap(), Epoch(1), "nobody has seen the other's");
+        drop(first);
+        assert_eq!(Store::open(directory).unwrap().begin_epoch().unwrap(), Epoch(2));
+    }
+
+    #[test]
+    fn a_coordinator_that_takes_no_terms_is_not_taken_over() {
+        let directory = tempfile::tempdir().unwrap();
+        let earlier = Store::open(directory.path()).unwrap();
+        assert!(matches!(Store::open(directory.path()), Err(StartError::InUse { .. })));
+        drop(earlier);
+        assert_eq!(Store::open(directory.path()).unwrap().begin_epoch().unwrap(), Epoch(1));
     }
 
     #[test]

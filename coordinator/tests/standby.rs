@@ -2,19 +2,21 @@
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on panics")]
 
-use std::time::Duration;
+use std::{io::Write as _, time::Duration};
 
-use coordinator::{CoordinatorHandle, CoordinatorOptions, StartError, initialise, stand_by, start};
+use coordinator::{CoordinatorHandle, CoordinatorOptions, StartError, Vacancy, initialise, stand_by, start};
 use farm_core::message::Liveness;
 use proto::{
     control::{self, Invitation, SessionError},
     trust::Role,
 };
 
-fn options(state: &tempfile::TempDir, predecessor: Option<u64>) -> CoordinatorOptions {
+fn options(state: &tempfile::TempDir, vacancy: Option<Vacancy>) -> CoordinatorOptions {
     let state = Some(state.path().to_owned());
-    CoordinatorOptions { state, predecessor, secured: true, ..CoordinatorOptions::embedded() }
+    CoordinatorOptions { state, vacancy, secured: true, ..CoordinatorOptions::embedded() }
 }
+
+const SILENT: Vacancy = Vacancy { term: 1, silent: true };
 
 fn address(handle: &CoordinatorHandle) -> String {
     handle.grpc_addr().to_string()
@@ -33,7 +35,7 @@ async fn a_successor_has_what_was_acknowledged_and_its_predecessor_changes_nothi
     let (_, token) = control::create_token(&address(&first), Some(&operator), &invitation()).await.unwrap();
 
     // Alive as it is: what a standby does when it has been silent for long enough.
-    let second = start(options(&state, Some(1))).await.unwrap();
+    let second = start(options(&state, Some(SILENT))).await.unwrap();
     let refused = control::create_token(&address(&first), Some(&operator), &invitation()).await.unwrap_err();
     let SessionError::Failed { reason } = &refused else { panic!("{refused:?}") };
     assert!(reason.contains("another coordinator has taken the farm over"), "{reason}");
@@ -46,9 +48,9 @@ async fn a_successor_has_what_was_acknowledged_and_its_predecessor_changes_nothi
     let tokens = control::list_tokens(&address(&second), Some(&operator)).await.unwrap();
     assert!(tokens.is_empty(), "what the first one refused is not there: {tokens:?}");
     drop(first);
-    assert!(matches!(start(options(&state, Some(1))).await, Err(StartError::Outrun)), "one follows");
+    assert!(matches!(start(options(&state, Some(SILENT))).await, Err(StartError::Outrun)), "one follows");
     assert!(
-        matches!(start(options(&state, None)).await, Err(StartError::State { .. })),
+        matches!(start(options(&state, None)).await, Err(StartError::InUse { .. })),
         "who does not stand by is refused while another one leads"
     );
     second.shutdown().await;
@@ -68,7 +70,11 @@ async fn a_standby_follows_a_leader_that_ended_without_waiting() {
     let directory = state.path().to_owned();
     let waiting = tokio::spawn(async move { stand_by(&directory, liveness).await });
     first.shutdown().await;
-    assert_eq!(waiting.await.unwrap().unwrap(), 1, "its process lets go of the lock");
+    assert_eq!(
+        waiting.await.unwrap().unwrap(),
+        Vacancy { term: 1, silent: false },
+        "its process lets go of the lock"
+    );
 }
 
 /// Of several addresses the one that leads is found, whichever it is; one that only takes connections does not count.
@@ -83,6 +89,26 @@ async fn the_coordinator_that_answers_is_found() {
         format!("{},{},{closed}", address(&handle), mute.1),
     ] {
         control::status(&list, None).await.unwrap();
+    }
+    // One that leads while the mute one is waited for is found, too.
+    let later = std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap();
+    let list = format!("{}, {later}", mute.1);
+    let (found, standby) = tokio::join!(control::status(&list, None), async {
+        tokio::time::sleep(Duration::from_millis(500)).await;
+        start(CoordinatorOptions { listen: later, ..CoordinatorOptions::embedded() }).await.unwrap()
+    });
+    found.unwrap();
+    standby.shutdown().await;
+    // Somebody else's port beside it is not the farm's answer.
+    let other = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+    let stranger = other.local_addr().unwrap();
+    std::thread::spawn(move || {
+        for stream in other.incoming() {
+            let _ = stream.unwrap().write_all(b"HTTP/1.1 400 Bad Request\r\n\r\n");
+        }
+    });
+    for _ in 0..8 {
+        control::status(&format!("{stranger},{}", address(&handle)), None).await.unwrap();
     }
     let error = control::status(&format!("{closed},{}", mute.1), None).await.unwrap_err().to_string();
     assert!(error.contains(&closed) && error.contains("no answer within"), "{error}");

@@ -136,9 +136,14 @@ fn usage(error: SessionError) -> Failure {
 pub(crate) fn failure(error: SessionError) -> Failure {
     match error {
         SessionError::Address { .. } => Failure::Usage(error.into()),
-        SessionError::Unreachable { .. } => Failure::Unreachable(anyhow::Error::new(error).context(
-            "no farm answers; start one with `farmctl up`, or name it with --coordinator or GLEANER_COORDINATOR",
-        )),
+        SessionError::Unreachable { ref address, .. } => {
+            let hint = if address.contains(',') {
+                "none of the coordinators answers; if one just ended, its standby leads within some 10 s: try again then"
+            } else {
+                "no farm answers; start one with `farmctl up`, or name it with --coordinator or GLEANER_COORDINATOR"
+            };
+            Failure::Unreachable(anyhow::Error::new(error).context(hint))
+        }
         SessionError::Denied { .. } => Failure::Denied(error.into()),
         SessionError::Ended { .. }
         | SessionError::Malformed { .. }

@@ -9,10 +9,9 @@ use std::{
 };
 
 use farm_core::{
-    id::{ContentHash, DeviceIndex, JobAttempt, LinkId, NodeId},
+    id::{DeviceIndex, JobAttempt, LinkId, NodeId},
     message::{
         AppToNode, CoordinatorToNode, JobFailure, JobTicket, LatencyClass, NodeToApp, NodeToCoordinator,
-        ResultHeader,
     },
     program::Content,
     time,
@@ -108,8 +107,6 @@ struct Driver {
     contents: Contents,
     programs: Programs,
     spool: Spool,
-    /// Names of contents that jobs may have come or gone with in this turn.
-    renamed: Vec<ContentHash>,
     /// Failures that the driver itself found, to be told to the machine in the next turn.
     found: Vec<Event>,
     registered: Option<oneshot::Sender<NodeId>>,
@@ -145,7 +142,6 @@ pub(crate) async fn drive(setup: Setup) -> End {
         devices: devices.into_iter().map(Device::new).collect(),
         programs: Programs::default(),
         spool,
-        renamed: Vec::new(),
         found: Vec::new(),
         registered: Some(registered),
         end: None,
@@ -319,18 +315,22 @@ impl Driver {
     /// # Errors
     /// It may not.
     fn check_hello(&mut self, link: LinkId, frame: &Frame<AppToNode>) -> Result<(), String> {
-        let (Some(own), AppToNode::Hello { app, incarnation, .. }) = (&self.options.identity, &frame.header)
-        else {
-            return Ok(());
-        };
+        let AppToNode::Hello { app, incarnation, .. } = &frame.header else { return Ok(()) };
         let nobody = "nobody has shown who this is";
         let outbox = self.links.get_mut(&link).ok_or(nobody)?;
-        let shown = Capability::check(&frame.payload, own, outbox.peer().ok_or(nobody)?, SystemTime::now())
-            .map_err(|error| error.to_string())?;
-        if (shown.app, shown.incarnation) != (*app, *incarnation) {
-            return Err(format!("the capability is for {}, {}", shown.app, shown.incarnation));
-        }
-        outbox.set_scope(Scope::of(&shown.project));
+        let scope = match &self.options.identity {
+            None => Scope::OPEN,
+            Some(own) => {
+                let peer = outbox.peer().ok_or(nobody)?;
+                let shown = Capability::check(&frame.payload, own, peer, SystemTime::now())
+                    .map_err(|error| error.to_string())?;
+                if (shown.app, shown.incarnation) != (*app, *incarnation) {
+                    return Err(format!("the capability is for {}, {}", shown.app, shown.incarnation));
+                }
+                Scope::of(&shown.project)
+            }
+        };
+        outbox.introduce(*app, scope);
         Ok(())
     }
 
@@ -342,40 +342,47 @@ impl Driver {
         for content in tickets.iter_mut().flat_map(|ticket| &mut ticket.contents) {
             let digest = content.hash;
             content.hash = scope.name(digest);
-            self.contents.is_called(digest, content.hash);
-            self.renamed.push(content.hash);
+            let machine = &self.machine;
+            self.contents.is_called(digest, content.hash, |name| machine.needs(name));
         }
     }
 
-    fn app_said(&mut self, link: LinkId, mut frame: Frame<AppToNode>) {
-        if let Err(reason) = self.check_hello(link, &frame) {
-            tracing::warn!(%link, reason, "an application was refused");
-            if let Some(outbox) = self.links.remove(&link) {
-                outbox.send(NodeToApp::Refused { reason });
-                outbox.close("refused");
-            }
+    fn app_said(&mut self, link: LinkId, frame: Frame<AppToNode>) {
+        // What came after what it was refused for is nobody's word.
+        if !self.links.contains_key(&link) {
             return;
         }
-        if let AppToNode::Jobs(tickets) = &mut frame.header {
-            let scope = self.links.get(&link).map_or(Scope::OPEN, Outbox::scope);
-            self.name_contents(scope, tickets);
-            match codec::unpack_programs(frame.payload, tickets.len()) {
-                Ok(programs) => {
-                    for (ticket, bytes) in tickets.iter().zip(programs) {
-                        self.programs.keep(ticket.job, Program { bytes, scope });
-                    }
+        match self.check_hello(link, &frame).and_then(|()| self.unpack(link, frame)) {
+            Ok(message) => self.tell(Event::FromApp { link, message }),
+            Err(reason) => {
+                tracing::warn!(%link, reason, "an application was refused, or broke the protocol");
+                if let Some(outbox) = self.links.remove(&link) {
+                    outbox.send(NodeToApp::Refused { reason });
+                    outbox.close("refused");
                 }
-                Err(error) => {
-                    tracing::warn!(%link, %error, "an application broke the protocol");
-                    if let Some(outbox) = self.links.remove(&link) {
-                        outbox.sender().close("broken job frame");
-                    }
-                    self.tell(Event::AppLinkClosed { link });
-                    return;
-                }
+                self.tell(Event::AppLinkClosed { link });
             }
         }
-        self.tell(Event::FromApp { link, message: frame.header });
+    }
+
+    /// The message of a frame; the programs of jobs are kept.
+    ///
+    /// # Errors
+    /// They are not those of the application that the link is of.
+    fn unpack(&mut self, link: LinkId, frame: Frame<AppToNode>) -> Result<AppToNode, String> {
+        let AppToNode::Jobs(mut tickets) = frame.header else { return Ok(frame.header) };
+        let app = self.links.get(&link).and_then(Outbox::app);
+        let (app, scope) = app.ok_or("jobs came before a hello")?;
+        if tickets.iter().any(|ticket| ticket.job.job.app != app) {
+            return Err(format!("a job is not of {app}"));
+        }
+        let programs =
+            codec::unpack_programs(frame.payload, tickets.len()).map_err(|error| error.to_string())?;
+        self.name_contents(scope, &mut tickets);
+        for (ticket, bytes) in tickets.iter().zip(programs) {
+            self.programs.keep(ticket.job, Program { bytes, scope });
+        }
+        Ok(AppToNode::Jobs(tickets))
     }
 
     fn heard(&mut self, DeviceEvent { device, what }: DeviceEvent) {
@@ -416,11 +423,6 @@ impl Driver {
             while let Some(effect) = self.machine.poll_effect() {
                 self.act(effect);
             }
-            for name in self.renamed.drain(..) {
-                if !self.machine.needs(&name) {
-                    self.contents.is_called_no_more(&name);
-                }
-            }
             if !self.found.is_empty() {
                 for event in std::mem::take(&mut self.found) {
                     self.tell(event);
@@ -439,14 +441,7 @@ impl Driver {
     fn act(&mut self, effect: Effect) {
         match effect {
             Effect::ToCoordinator(message) => self.send_to_coordinator(message),
-            Effect::ToApp { link, mut message } => {
-                if let NodeToApp::Result(ResultHeader {
-                    outcome: Err(JobFailure::ContentUnavailable(content)),
-                    ..
-                }) = &mut message
-                {
-                    *content = self.contents.digest_of(*content);
-                }
+            Effect::ToApp { link, message } => {
                 if let Some(outbox) = self.links.get(&link) {
                     outbox.send(message);
                 }
@@ -467,10 +462,7 @@ impl Driver {
                 self.programs.discard(job);
                 self.spool.discard(job);
             }
-            Effect::Release(content) => {
-                self.contents.release(content);
-                self.renamed.push(content);
-            }
+            Effect::Release(hash) => self.contents.release(hash),
             Effect::Evict(contents) => self.found.extend(self.contents.evict(&contents)),
             // After a refusal the machine exits too; the refusal is the reason.
             Effect::Exit => {
@@ -479,8 +471,16 @@ impl Driver {
         }
     }
 
-    fn send_to_coordinator(&mut self, message: NodeToCoordinator) {
+    fn send_to_coordinator(&mut self, mut message: NodeToCoordinator) {
         let Some(coordinator) = &self.coordinator else { return };
+        if let NodeToCoordinator::Report { executed, .. } = &mut message {
+            for executed in executed {
+                // Its application knows it by the digest.
+                if let Some(JobFailure::ContentUnavailable(content)) = &mut executed.failure {
+                    *content = self.contents.digest_of(*content);
+                }
+            }
+        }
         if let Err(error) = coordinator.try_send(message) {
             // A coordinator that does not read for QUEUED_MESSAGES messages is as good as lost; the next hello's
             // inventory says what it missed.

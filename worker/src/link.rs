@@ -7,7 +7,7 @@ use std::{
 };
 
 use farm_core::{
-    id::{ContentHash, JobAttempt, LinkId},
+    id::{AppId, ContentHash, JobAttempt, LinkId},
     message::{AppToNode, Contact, NodeToApp, ResultHeader},
     program::Content,
 };
@@ -120,8 +120,8 @@ pub(crate) struct Outbox {
     sender: LinkSender<NodeToApp>,
     /// Who is at the other end, in a secured farm.
     peer: Option<Principal>,
-    /// Whose contents an application's jobs name.
-    scope: Scope,
+    /// Which application it is, and whose contents its jobs name; `None` before a hello that was let in.
+    app: Option<(AppId, Scope)>,
     /// `Some` while frames wait. A lock, not messages: the forwarder must end and the owner must see that it ended in
     /// one step, or a frame could be left behind. Held for a push or a pop. At most one result of each job held
     /// waits here (`MAX_JOBS`).
@@ -138,7 +138,7 @@ impl Outbox {
         spool: Spool,
         inputs: mpsc::Sender<Input>,
     ) -> Self {
-        Self { sender, peer, scope: Scope::OPEN, backlog: Arc::new(Mutex::new(None)), spool, inputs }
+        Self { sender, peer, app: None, backlog: Arc::new(Mutex::new(None)), spool, inputs }
     }
 
     /// Who is at the other end, in a secured farm.
@@ -146,14 +146,14 @@ impl Outbox {
         self.peer.as_ref()
     }
 
-    /// Whose contents the application's jobs name.
-    pub(crate) const fn scope(&self) -> Scope {
-        self.scope
+    /// Which application it is, and whose contents its jobs name; `None` before a hello that was let in.
+    pub(crate) const fn app(&self) -> Option<(AppId, Scope)> {
+        self.app
     }
 
-    /// The application has shown its project.
-    pub(crate) const fn set_scope(&mut self, scope: Scope) {
-        self.scope = scope;
+    /// Its hello is let in.
+    pub(crate) const fn introduce(&mut self, app: AppId, scope: Scope) {
+        self.app = Some((app, scope));
     }
 
     /// The link, for fetching.

@@ -10,13 +10,15 @@ use std::{
     time::{Duration, SystemTime},
 };
 
+use bytes::Bytes;
 use client_sdk::{Farm, FarmError, FarmOptions, TaskGraph};
 use coordinator::{CoordinatorHandle, CoordinatorOptions, initialise, start};
 use farm_core::{
-    id::{AppId, AppIncarnation, Attempt, DeviceIndex, Epoch, JobAttempt, JobId, JobIndex, TaskId},
+    device::Requirements,
+    id::{AppId, AppIncarnation, BatchId, DeviceIndex, Epoch, JobAttempt, JobId, JobIndex, TaskId},
     message::{
-        AppHello, AppToCoordinator, AppToNode, CoordinatorToApp, CostNs, JobFailure, JobTicket, LatencyClass,
-        NodeToApp, PROTOCOL_VERSION, Priority,
+        AppHello, AppToCoordinator, AppToNode, CoordinatorToApp, CostNs, JobTicket, LatencyClass, NodeToApp,
+        PROTOCOL_VERSION, Plan, PlanJob, PlanRequest, Priority,
     },
     program::{Content, JobProgram},
     project::QuotaChange,
@@ -25,7 +27,7 @@ use proto::{
     codec,
     control::{self, Invitation, Session},
     link::{self, Arrived, ContentBytes, ContentSource, Link},
-    trust::{Authority, Capability, IDENTITY_LIFETIME, Identity, Role},
+    trust::{Authority, Capability, IDENTITY_LIFETIME, Identity, Role, Scope},
 };
 use tempfile::TempDir;
 use worker::{End, StartError, WorkerHandle, WorkerOptions};
@@ -109,7 +111,7 @@ struct Introduced {
     id: (AppId, AppIncarnation),
     /// Its capability.
     given: Vec<u8>,
-    _session: Session<AppToCoordinator, CoordinatorToApp>,
+    session: Session<AppToCoordinator, CoordinatorToApp>,
 }
 
 async fn introduce(farm: &SecuredFarm, who: &Identity) -> Introduced {
@@ -131,91 +133,7 @@ async fn introduce(farm: &SecuredFarm, who: &Identity) -> Introduced {
         CoordinatorToApp::Welcome { app, incarnation, .. } => (app, incarnation),
         other => panic!("got {other:?}"),
     };
-    Introduced { id, given, _session: session }
-}
-
-/// Has the node run a job that names `content`, as somebody whose data server has `contents`: what becomes of it.
-async fn outcome_of_naming(
-    farm: &SecuredFarm,
-    worker: &WorkerHandle,
-    who: &Identity,
-    content: Content,
-    contents: ContentSource,
-) -> Result<Vec<u64>, JobFailure> {
-    let Introduced { id, given, _session } = introduce(farm, who).await;
-    let mut link = dial_with(worker, Some(who), contents).await.unwrap();
-    let welcome = say_hello(&mut link, id, given).await;
-    assert!(matches!(welcome, Some(NodeToApp::Welcome { .. })), "{welcome:?}");
-    let mut program = JobProgram::default();
-    let buffer = program.malloc(4).unwrap();
-    program.task_allocation(content);
-    program.memcpy_dtoh(buffer, 0, 4).unwrap();
-    let job = JobId { app: id.0, task: TaskId(1), index: JobIndex(0) };
-    let ticket = JobTicket {
-        job: JobAttempt { job, attempt: Attempt { epoch: Epoch(1), sequence: 1 } },
-        device: DeviceIndex(0),
-        class: LatencyClass::Batch,
-        priority: Priority(0),
-        cost: CostNs(0),
-        contents: vec![content],
-    };
-    let payload = codec::pack_programs([&codec::encode_program(&program).unwrap()]);
-    link.sender.send(AppToNode::Jobs(vec![ticket]), payload).await.unwrap();
-    let mut frames = Vec::new();
-    loop {
-        let came =
-            tokio::time::timeout(Duration::from_secs(20), link.receiver.recv_many(&mut frames, 8)).await;
-        came.expect("the job ends").expect("the link stands");
-        for frame in frames.drain(..) {
-            if let NodeToApp::Result(header) = frame.header {
-                return header.outcome;
-            }
-        }
-    }
-}
-
-/// Scenarios 29 and 30: what a project's application has brought here is there for that project. Another one that knows its digest
-/// gets nothing by it, unless it has the bytes itself.
-#[tokio::test(flavor = "multi_thread")]
-async fn s29_a_digest_gives_no_access_to_another_projects_contents() {
-    let farm = SecuredFarm::start().await;
-    for project in ["films", "science"] {
-        let set = control::set_project(&farm.address, Some(&farm.operator), project, QuotaChange::default());
-        set.await.unwrap();
-    }
-    let worker = farm.add_worker("n").await;
-    let artist = farm.join_project(Role::App, "artist", Some("films")).await;
-    let colleague = farm.join_project(Role::App, "colleague", Some("films")).await;
-    let stranger = farm.join_project(Role::App, "stranger", Some("science")).await;
-    let scene = ContentBytes::new(vec![7; 3 << 20]);
-    let content = scene.content();
-    let served = Arc::new(AtomicU64::new(0));
-    let source = || {
-        let scene = scene.clone();
-        ContentSource::new(move |hash| (hash == content.hash).then(|| scene.clone()))
-            .counted_in(Arc::clone(&served))
-    };
-    let name = |who, contents| outcome_of_naming(&farm, &worker, who, content, contents);
-    assert_eq!(
-        name(&stranger, ContentSource::empty()).await,
-        Err(JobFailure::ContentUnavailable(content.hash))
-    );
-    assert_eq!(name(&artist, source()).await, Ok(vec![4]));
-    assert_eq!(served.load(Ordering::Relaxed), content.size_bytes, "the first brings it");
-    assert_eq!(name(&colleague, ContentSource::empty()).await, Ok(vec![4]), "it is there for the project");
-    assert_eq!(
-        name(&stranger, ContentSource::empty()).await,
-        Err(JobFailure::ContentUnavailable(content.hash)),
-        "and for no other"
-    );
-    assert_eq!(name(&stranger, source()).await, Ok(vec![4]));
-    assert_eq!(
-        served.load(Ordering::Relaxed),
-        2 * content.size_bytes,
-        "a miss: who has the bytes sends them"
-    );
-    worker.drain().await;
-    farm.coordinator.shutdown().await;
+    Introduced { id, given, session }
 }
 
 /// The node's answer to a hello; `None` if it closed the link.
@@ -230,6 +148,177 @@ async fn say_hello(
     let answer = tokio::time::timeout(Duration::from_secs(20), link.receiver.recv_many(&mut frames, 1)).await;
     answer.expect("the node answers or closes").ok()?;
     frames.pop().map(|frame| frame.header)
+}
+
+/// A job of one attempt that names `content` in its program, and, if `told`, in its ticket.
+fn job_naming(job: JobAttempt, content: Content, told: bool) -> (AppToNode, Vec<Bytes>) {
+    let mut program = JobProgram::default();
+    let buffer = program.malloc(4).unwrap();
+    program.task_allocation(content);
+    program.memcpy_dtoh(buffer, 0, 4).unwrap();
+    let ticket = JobTicket {
+        job,
+        device: DeviceIndex(0),
+        class: LatencyClass::Batch,
+        priority: Priority(0),
+        cost: CostNs(0),
+        contents: if told { vec![content] } else { Vec::new() },
+    };
+    (AppToNode::Jobs(vec![ticket]), codec::pack_programs([&codec::encode_program(&program).unwrap()]))
+}
+
+impl Introduced {
+    /// The attempt of a job that the coordinator plans.
+    async fn planned(&mut self, content: Content) -> JobAttempt {
+        let request = PlanRequest {
+            batch: BatchId(1),
+            task: TaskId(1),
+            jobs: vec![PlanJob { index: JobIndex(0), cost: CostNs(0) }],
+            needs: Requirements::ANY,
+            module: None,
+            contents: vec![content],
+            held: Vec::new(),
+        };
+        self.session.sender.try_send(AppToCoordinator::Plan(request)).unwrap();
+        loop {
+            if let CoordinatorToApp::Plan(plan) = self.session.receiver.recv().await.unwrap() {
+                return plan.nodes[0].devices[0].jobs[0];
+            }
+        }
+    }
+}
+
+/// Has the node run a job that names `content`, as somebody whose data server has `contents`. Whether it did; if not, the coordinator
+/// plans it again, since the node could not get the content.
+async fn runs_naming(
+    farm: &SecuredFarm,
+    worker: &WorkerHandle,
+    who: &Identity,
+    content: Content,
+    contents: ContentSource,
+) -> bool {
+    let mut app = introduce(farm, who).await;
+    let job = app.planned(content).await;
+    let mut link = dial_with(worker, Some(who), contents).await.unwrap();
+    let welcome = say_hello(&mut link, app.id, app.given.clone()).await;
+    assert!(matches!(welcome, Some(NodeToApp::Welcome { .. })), "{welcome:?}");
+    let (jobs, payload) = job_naming(job, content, true);
+    link.sender.send(jobs, payload).await.unwrap();
+    loop {
+        tokio::select! {
+            frame = link.receiver.recv() => {
+                if let NodeToApp::Result(header) = frame.unwrap().header {
+                    assert_eq!((header.job, header.outcome), (job, Ok(vec![4])));
+                    return true;
+                }
+            }
+            heard = app.session.receiver.recv() => {
+                if matches!(heard.unwrap(), CoordinatorToApp::Plan(Plan { batch: None, .. })) {
+                    return false;
+                }
+            }
+            () = tokio::time::sleep(Duration::from_secs(60)) => panic!("the job has no end"),
+        }
+    }
+}
+
+async fn farm_with_projects() -> SecuredFarm {
+    let farm = SecuredFarm::start().await;
+    for project in ["films", "science"] {
+        let set = control::set_project(&farm.address, Some(&farm.operator), project, QuotaChange::default());
+        set.await.unwrap();
+    }
+    farm
+}
+
+/// Scenarios 29 and 30: what a project's application has brought here is there for that project. Another one that knows its digest
+/// gets nothing by it, unless it has the bytes itself.
+#[tokio::test(flavor = "multi_thread")]
+async fn s29_a_digest_gives_no_access_to_another_projects_contents() {
+    let farm = farm_with_projects().await;
+    let worker = farm.add_worker("n").await;
+    let artist = farm.join_project(Role::App, "artist", Some("films")).await;
+    let colleague = farm.join_project(Role::App, "colleague", Some("films")).await;
+    let stranger = farm.join_project(Role::App, "stranger", Some("science")).await;
+    let scene = ContentBytes::new(vec![7; 3 << 20]);
+    let content = scene.content();
+    let served = Arc::new(AtomicU64::new(0));
+    let source = || {
+        let scene = scene.clone();
+        ContentSource::new(move |hash| (hash == content.hash).then(|| scene.clone()))
+            .counted_in(Arc::clone(&served))
+    };
+    let naming = |who, contents| runs_naming(&farm, &worker, who, content, contents);
+    assert!(!naming(&stranger, ContentSource::empty()).await, "nobody has it");
+    assert!(naming(&artist, source()).await);
+    assert_eq!(served.load(Ordering::Relaxed), content.size_bytes, "the first brings it");
+    assert!(naming(&colleague, ContentSource::empty()).await, "it is there for the project");
+    assert!(!naming(&stranger, ContentSource::empty()).await, "and for no other");
+    assert!(naming(&stranger, source()).await);
+    assert_eq!(
+        served.load(Ordering::Relaxed),
+        2 * content.size_bytes,
+        "a miss: who has the bytes sends them"
+    );
+    worker.drain().await;
+    farm.coordinator.shutdown().await;
+}
+
+/// A hello that is refused ends the link's rights: what comes after it, with the names that the node has for another project's
+/// contents, is not run.
+#[tokio::test(flavor = "multi_thread")]
+async fn what_follows_a_refused_hello_is_nobodys_word() {
+    let farm = farm_with_projects().await;
+    let worker = farm.add_worker("n").await;
+    let artist = farm.join_project(Role::App, "artist", Some("films")).await;
+    let stranger = farm.join_project(Role::App, "stranger", Some("science")).await;
+    let (scene, own) = (ContentBytes::new(vec![7; 3 << 20]), ContentBytes::new(vec![8; 16]));
+    let source = |bytes: &ContentBytes| {
+        let bytes = bytes.clone();
+        ContentSource::new(move |hash| (hash == bytes.content().hash).then(|| bytes.clone()))
+    };
+    assert!(runs_naming(&farm, &worker, &artist, scene.content(), source(&scene)).await);
+    let name = Content { hash: Scope::of("films").name(scene.content().hash), ..scene.content() };
+
+    let mut app = introduce(&farm, &stranger).await;
+    let own_job = app.planned(own.content()).await;
+    let other = JobAttempt { job: JobId { index: JobIndex(9), ..own_job.job }, ..own_job };
+    let hello = AppToNode::Hello { protocol: PROTOCOL_VERSION, app: app.id.0, incarnation: app.id.1 };
+    let (jobs, payload) = job_naming(other, name, false);
+    // With the rights of an earlier hello, and with none.
+    for introduced in [true, false] {
+        let mut link = dial_with(&worker, Some(&stranger), ContentSource::empty()).await.unwrap();
+        if introduced {
+            let welcome = say_hello(&mut link, app.id, app.given.clone()).await;
+            assert!(matches!(welcome, Some(NodeToApp::Welcome { .. })), "{welcome:?}");
+            link.sender.send(hello.clone(), vec![Bytes::from_static(b"x")]).await.unwrap();
+        }
+        link.sender.send(jobs.clone(), payload.clone()).await.unwrap();
+        // To its end, which the node makes.
+        while let Ok(frame) = link.receiver.recv().await {
+            assert!(matches!(frame.header, NodeToApp::Refused { .. }), "{:?}", frame.header);
+        }
+    }
+    // Another application's job is not this one's to bring.
+    let mut link = dial_with(&worker, Some(&stranger), source(&own)).await.unwrap();
+    let foreign = JobAttempt { job: JobId { app: AppId(app.id.0.0 - 1), ..other.job }, ..other };
+    say_hello(&mut link, app.id, app.given.clone()).await;
+    let (jobs, payload) = job_naming(foreign, own.content(), true);
+    link.sender.send(jobs, payload).await.unwrap();
+    while link.receiver.recv().await.is_ok() {}
+
+    let mut link = dial_with(&worker, Some(&stranger), source(&own)).await.unwrap();
+    say_hello(&mut link, app.id, app.given.clone()).await;
+    let (jobs, payload) = job_naming(own_job, own.content(), true);
+    link.sender.send(jobs, payload).await.unwrap();
+    let result = loop {
+        if let NodeToApp::Result(header) = link.receiver.recv().await.unwrap().header {
+            break header;
+        }
+    };
+    assert_eq!(result.job, own_job, "nothing else was run for it before");
+    worker.drain().await;
+    farm.coordinator.shutdown().await;
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -288,7 +377,7 @@ async fn a_node_lets_in_whom_the_coordinator_vouches_for() {
     }
 
     // What an application of this farm shows, if it is what the coordinator gave, is enough; all else is not.
-    let Introduced { id, given, _session } = introduce(&farm, &app).await;
+    let Introduced { id, given, session: _session } = introduce(&farm, &app).await;
     let own_word = Capability {
         app: id.0,
         incarnation: id.1,

@@ -114,7 +114,7 @@ async fn finish(
 ) -> Result<(), Failure> {
     match result {
         Ok(summary) => {
-            write_images(render.image(), arguments).await?;
+            write_images(render.image(), arguments.images.clone(), arguments).await?;
             tell_summary(&summary, render, arguments)
         }
         Err(error) => {
@@ -131,13 +131,26 @@ async fn save_partial(render: &RenderHandle, arguments: &RenderArgs) -> Result<(
         tell!("farmctl: nothing was rendered yet: no image was written");
         return Ok(());
     }
-    write_images(image, arguments).await?;
-    tell!("farmctl: saved a partial image: {} of {} samples", progress.samples, progress.total_samples);
+    // What an earlier render has finished stays.
+    let paths: Vec<PathBuf> = arguments
+        .images
+        .iter()
+        .map(|path| if path.exists() { path.with_extension(partial_extension(path)) } else { path.clone() })
+        .collect();
+    write_images(image, paths.clone(), arguments).await?;
+    let names: Vec<String> = paths.iter().map(|path| path.display().to_string()).collect();
+    let (samples, total, names) = (progress.samples, progress.total_samples, names.join(", "));
+    tell!("farmctl: saved a partial image: {samples} of {total} samples, in {names}");
     Ok(())
 }
 
-async fn write_images(image: Image, arguments: &RenderArgs) -> Result<(), Failure> {
-    let paths = arguments.images.clone();
+/// `partial.exr` for an image in EXR.
+fn partial_extension(path: &Path) -> String {
+    let format = path.extension().unwrap_or_default().to_string_lossy();
+    format!("partial.{format}")
+}
+
+async fn write_images(image: Image, paths: Vec<PathBuf>, arguments: &RenderArgs) -> Result<(), Failure> {
     let tone = Tone { exposure_ev: arguments.exposure };
     // One that cannot be written must not cost the others.
     let written = tokio::task::spawn_blocking(move || {

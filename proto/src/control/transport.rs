@@ -1,10 +1,21 @@
 //! Settings of the gRPC connections, the same at both ends.
 
-use std::{error::Error, io, sync::Arc, time::Duration};
+use std::{
+    error::Error,
+    io,
+    sync::{
+        Arc,
+        atomic::{AtomicUsize, Ordering},
+    },
+    time::Duration,
+};
 
 use hyper_util::rt::TokioIo;
 use rustls::pki_types::ServerName;
-use tokio::task::JoinSet;
+use tokio::{
+    task::JoinSet,
+    time::{Instant, sleep},
+};
 use tokio_rustls::TlsConnector;
 use tonic::{
     Code, Request, Status,
@@ -35,6 +46,8 @@ const STREAM_WINDOW_BYTES: u32 = 4 << 20;
 pub const CONNECTION_WINDOW_BYTES: u32 = 8 << 20;
 /// Most addresses of a farm's coordinators.
 const MAX_COORDINATORS: usize = 8;
+/// Pause before one of several coordinators that did not answer is tried again, while another one is waited for.
+const REDIAL: Duration = Duration::from_millis(250);
 /// Sessions and requests of one connection at a time.
 const STREAMS_PER_CONNECTION: u32 = 64;
 
@@ -82,7 +95,7 @@ pub fn trust_server<T: v1::trust_server::Trust>(trust: T) -> v1::trust_server::T
 /// # Errors
 /// [`SessionError::Address`] names the one that is none.
 pub fn coordinator_addresses(coordinator: &str) -> Result<Vec<&str>, SessionError> {
-    let addresses: Vec<&str> = coordinator.split(',').collect();
+    let addresses: Vec<&str> = coordinator.split(',').map(str::trim).collect();
     if addresses.len() > MAX_COORDINATORS {
         let reason = format!("at most {MAX_COORDINATORS} coordinators may be named");
         return Err(SessionError::Address { address: coordinator.to_owned(), reason });
@@ -101,28 +114,55 @@ pub(super) async fn connect(
     if let [only] = addresses[..] {
         return dial(only, tls).await;
     }
+    let end = Instant::now() + ADMIN_TIMEOUT;
+    // Those that have neither answered nor failed.
+    let open = Arc::new(AtomicUsize::new(addresses.len()));
     let mut dials = JoinSet::new();
     for address in addresses {
-        let (address, tls) = (address.to_owned(), tls.clone());
+        let (address, tls, open) = (address.to_owned(), tls.clone(), Arc::clone(&open));
         dials.spawn(async move {
-            let channel = dial(&address, tls).await?;
-            answers(&address, channel.clone()).await?;
-            Ok(channel)
+            let mut failed = false;
+            loop {
+                let error = match dial_and_ask(&address, tls.clone()).await {
+                    Ok(channel) => return Ok(channel),
+                    Err(error) => error,
+                };
+                if !std::mem::replace(&mut failed, true) {
+                    open.fetch_sub(1, Ordering::Relaxed);
+                }
+                // A standby may begin to lead while a leader that was stopped is waited for.
+                let waits = open.load(Ordering::Relaxed) > 0 && Instant::now() < end;
+                if !(waits && matches!(error, SessionError::Unreachable { .. })) {
+                    return Err(error);
+                }
+                sleep(REDIAL).await;
+            }
         });
     }
-    let mut failures = Vec::new();
+    let (mut silent, mut telling) = (Vec::new(), None);
     while let Some(dialled) = dials.join_next().await {
         match dialled {
             Ok(Ok(channel)) => return Ok(channel),
             Ok(Err(SessionError::Unreachable { address, reason })) => {
-                failures.push(format!("{address}: {reason}"))
+                silent.push(format!("{address}: {reason}"));
             }
-            // Somebody is there, and does not let the caller in.
-            Ok(Err(error)) => return Err(error),
-            Err(error) => failures.push(error.to_string()),
+            // Somebody is there, and is none, or does not let the caller in.
+            Ok(Err(error)) => telling = telling.filter(is_denial).or(Some(error)),
+            Err(error) => silent.push(error.to_string()),
         }
     }
-    Err(SessionError::Unreachable { address: coordinator.to_owned(), reason: failures.join("; ") })
+    let reason = silent.join("; ");
+    Err(telling.unwrap_or_else(|| SessionError::Unreachable { address: coordinator.to_owned(), reason }))
+}
+
+async fn dial_and_ask(address: &str, tls: Option<rustls::ClientConfig>) -> Result<Channel, SessionError> {
+    let channel = dial(address, tls).await?;
+    answers(address, channel.clone()).await?;
+    Ok(channel)
+}
+
+const fn is_denial(error: &SessionError) -> bool {
+    matches!(error, SessionError::Denied { .. })
 }
 
 /// Asks for a standard service that no coordinator has: whoever says so is there.
@@ -205,6 +245,9 @@ fn endpoint(coordinator: &str) -> Result<Endpoint, SessionError> {
     let (host, port) = coordinator.rsplit_once(':').ok_or_else(|| bad("the port is missing"))?;
     if host.is_empty() {
         return Err(bad("the host is missing"));
+    }
+    if host.contains('/') {
+        return Err(bad("it is host and port alone, without http://"));
     }
     if !port.parse::<u16>().is_ok_and(|port| port > 0) {
         return Err(bad("the port is not a number from 1 to 65535"));

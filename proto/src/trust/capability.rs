@@ -96,6 +96,9 @@ impl Capability {
             // A year that no clock reaches is not a reason to panic.
             expires: SystemTime::UNIX_EPOCH + Duration::from_secs(claims.expires_s.min(u64::from(u32::MAX))),
         };
+        if capability.project.is_empty() {
+            return Err(wrong("names no project: it is of an earlier version".to_owned()));
+        }
         if capability.expires <= now {
             return Err(wrong("is over".to_owned()));
         }

@@ -27,11 +27,16 @@ use crate::{driver::Input, link::Source};
 /// Most bytes that broken off fetches leave in memory; those of a further one come again from the start.
 const MAX_ARRIVED_BYTES: u64 = 4 << 30;
 
+/// Names of contents whose digests are kept beyond those that jobs need.
+const MAX_NAMES: usize = 65_536;
+
 /// What is kept, and what is on its way.
 #[derive(Debug)]
 pub(crate) struct Contents {
-    /// What the bytes of those contents have as their digest that jobs need and that are not called by it.
+    /// What the bytes of those contents have as their digest that jobs need, or needed lately, and that are not called by it.
     digests: HashMap<ContentHash, ContentHash>,
+    /// When they are many: [`MAX_NAMES`], or twice those that were needed last.
+    most_names: usize,
     /// Whether names are digests.
     open: bool,
     memory: MemoryCache,
@@ -67,6 +72,7 @@ impl Contents {
         let disk = disk.map(|(folder, cap_bytes)| DiskCache::open(folder, cap_bytes)).transpose()?;
         Ok(Self {
             digests: HashMap::new(),
+            most_names: MAX_NAMES,
             open,
             memory: MemoryCache::new(memory_cap_bytes),
             disk,
@@ -94,17 +100,21 @@ impl Contents {
         }
     }
 
-    /// Jobs call bytes with this digest by that name.
-    pub(crate) fn is_called(&mut self, digest: ContentHash, name: ContentHash) {
+    /// Jobs call bytes with this digest by that name. Names that no job needs are forgotten when they become many.
+    pub(crate) fn is_called(
+        &mut self,
+        digest: ContentHash,
+        name: ContentHash,
+        is_needed: impl Fn(&ContentHash) -> bool,
+    ) {
+        if self.digests.len() >= self.most_names {
+            self.digests.retain(|name, _| is_needed(name));
+            self.most_names = MAX_NAMES.max(2 * self.digests.len());
+        }
         self.digests.insert(name, digest);
     }
 
-    /// No job needs a content of this name any more.
-    pub(crate) fn is_called_no_more(&mut self, name: &ContentHash) {
-        self.digests.remove(name);
-    }
-
-    /// The digest of a content that jobs need.
+    /// The digest of a content that jobs need, or needed lately.
     pub(crate) fn digest_of(&self, name: ContentHash) -> ContentHash {
         self.digests.get(&name).copied().unwrap_or(name)
     }
