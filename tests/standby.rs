@@ -15,7 +15,7 @@ fn coordinator(address: &str, state: &Path) -> Process {
     let state = state.to_str().unwrap();
     let flags = ["--standby", "--listen", address, "--http", "127.0.0.1:0", "--state", state];
     let mut process = Process::start("farm-coordinator", flags);
-    assert_eq!(process.next_json()["event"], "standby");
+    assert_eq!(process.next_json()["event"], "standby", "before it waits");
     process
 }
 

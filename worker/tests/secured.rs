@@ -208,7 +208,7 @@ async fn runs_naming(
         tokio::select! {
             frame = link.receiver.recv() => {
                 if let NodeToApp::Result(header) = frame.unwrap().header {
-                    assert_eq!((header.job, header.outcome), (job, Ok(vec![4])));
+                    assert_eq!((header.job, header.outcome), (job, Ok(vec![4])), "its own");
                     return true;
                 }
             }
@@ -365,10 +365,7 @@ async fn a_node_lets_in_whom_the_coordinator_vouches_for() {
         if let Some(mut link) = dial(&farm, &worker, who).await {
             let fetched = link
                 .sender
-                .fetch(
-                    Content { hash: proto::codec::content_hash(b"x"), size_bytes: 1 },
-                    &mut Arrived::default(),
-                )
+                .fetch(Content { hash: codec::content_hash(b"x"), size_bytes: 1 }, &mut Arrived::default())
                 .await;
             assert!(matches!(fetched, Err(link::FetchError::Link(_))), "{who:?}: {fetched:?}");
             let mut frames = Vec::new();
