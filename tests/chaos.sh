@@ -40,7 +40,7 @@ read -ra kinds <<<"${KINDS:-${all_kinds[*]}}"
 # which it is death.
 least_pause_ms=5000 most_pause_ms=20000
 least_stop_ms=2000 most_stop_ms=15000
-# The application gives up a coordinator that is away for 30 s.
+# The application tries a lost coordinator for 10 minutes.
 least_coordinator_ms=1000 most_coordinator_ms=8000
 least_restart_ms=2000 most_restart_ms=6000
 least_loss_percent=5 most_loss_percent=40

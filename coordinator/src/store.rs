@@ -157,9 +157,12 @@ impl Store {
     pub(crate) fn copied_by(directory: &Path, lead: Arc<Lead>) -> Result<Self, StartError> {
         let path = directory.join(file_of(lead.term()));
         let copy = path.with_extension(COPY);
-        lead.copies_to(&path);
         let copied = || -> io::Result<()> {
             let source = directory.join(file_of(latest_term(directory)?));
+            // What a start left behind that came no further is the only one, and stays.
+            if source != path {
+                lead.copies_to(&path);
+            }
             if source.try_exists()? {
                 fs::copy(&source, &copy)?;
                 fs::File::open(&copy)?.sync_all()?;
@@ -676,6 +679,19 @@ mod tests {
         assert_eq!(first.begin_epoch().unwrap(), Epoch(1), "nobody has seen the other's");
         drop(first);
         assert_eq!(Store::open(directory).unwrap().begin_epoch().unwrap(), Epoch(2));
+    }
+
+    #[test]
+    fn starts_that_fail_lose_nothing() {
+        let directory = tempfile::tempdir().unwrap();
+        let directory = directory.path();
+        // It leads, and fails before it serves, twice; then a standby that takes its predecessor for silent does.
+        for _ in 0..2 {
+            let store = Store::open(directory).unwrap().led_by(directory, lead(directory, None)).unwrap();
+            store.begin_epoch().unwrap();
+        }
+        Store::copied_by(directory, lead(directory, Some(0))).unwrap().begin_epoch().unwrap();
+        assert_eq!(Store::open(directory).unwrap().begin_epoch().unwrap(), Epoch(4));
     }
 
     #[test]

@@ -100,6 +100,10 @@ async fn tell_lines(progress: &mut watch::Receiver<Progress>, units: Units) {
                 "nodes": now.nodes,
                 "tasks": now.active_tasks.iter().map(|name| &**name).collect::<Vec<&str>>(),
                 "waiting": waits(&now),
+                "coordinator": match now.coordinator {
+                    CoordinatorLink::Up => "up",
+                    CoordinatorLink::Reconnecting => "lost",
+                },
             })
         };
         if let Some(Early { field: (name, value), .. }) = early.known().await {
@@ -136,11 +140,21 @@ async fn tell_bar(progress: &mut watch::Receiver<Progress>, units: Units) {
     bar.finish_and_clear();
 }
 
-/// Without a terminal only what needs a person's help is told, once each.
+/// Without a terminal only what needs a person's help is told, once each, and how the coordinator's absence begins and ends.
 async fn tell_waits(progress: &mut watch::Receiver<Progress>) {
     let (mut told, mut quota_told) = (None, false);
+    let mut link = CoordinatorLink::Up;
     loop {
-        let waiting = waits(&progress.borrow_and_update());
+        let (waiting, link_now) = {
+            let now = progress.borrow_and_update();
+            (waits(&now), now.coordinator)
+        };
+        if std::mem::replace(&mut link, link_now) != link_now {
+            match link_now {
+                CoordinatorLink::Reconnecting => tell!("farmctl: {COORDINATOR_LOST}"),
+                CoordinatorLink::Up => tell!("farmctl: the coordinator is there again"),
+            }
+        }
         let again = waiting == Some(OVER_QUOTA) && quota_told;
         if let Some(reason) = waiting.filter(|_| waiting != told && !again) {
             tell!("farmctl: waiting: {reason}");
@@ -164,7 +178,7 @@ fn message(now: &Progress, units: &Units, elapsed: Duration) -> String {
         return format!("waiting: {reason}");
     }
     if now.coordinator == CoordinatorLink::Reconnecting {
-        return "coordinator lost, trying again; nodes go on working".to_owned();
+        return COORDINATOR_LOST.to_owned();
     }
     if !begun {
         return String::new();
@@ -178,6 +192,7 @@ fn message(now: &Progress, units: &Units, elapsed: Duration) -> String {
     format!("{rate} {}/s  ETA {left}  nodes {}{quota}", units.name, now.nodes)
 }
 
+const COORDINATOR_LOST: &str = "coordinator lost, trying again; nodes go on working";
 const OVER_QUOTA: &str = "your project has as much of the farm as it may have (`farmctl project ls`)";
 
 /// Why nothing goes on, if it does not.
