@@ -197,7 +197,8 @@ impl CoordinatorHandle {
         }
     }
 
-    async fn taken_over(&self) {
+    /// Waits until another coordinator has taken the farm over. Cancel-safe.
+    pub async fn taken_over(&self) {
         match self.store.as_ref().and_then(|store| store.lead()) {
             Some(lead) => lead.over().await,
             None => std::future::pending().await,

@@ -75,8 +75,12 @@ async fn run(Settings { options, standby }: Settings) -> anyhow::Result<()> {
     writeln!(std::io::stdout(), "{ready}").context("cannot write the ready line to stdout")?;
 
     tokio::select! {
+        biased;
         () = asked_to_end(&mut interrupt, &mut terminate) => {}
-        () = handle.stopped() => anyhow::bail!("the coordinator ends; the log says why"),
+        () = handle.taken_over() => anyhow::bail!(
+            "another coordinator leads the farm: this one ends; started again with --standby it waits beside it"
+        ),
+        () = handle.stopped() => anyhow::bail!("the coordinator stopped by itself; the log says why"),
     }
     tracing::info!("ending; a second signal ends at once");
     tokio::select! {

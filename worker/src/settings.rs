@@ -51,7 +51,8 @@ pub(crate) struct Arguments {
     /// [default: the listening address].
     #[arg(long, value_name = "HOST:PORT", env = "GLEANER_ADVERTISE", value_delimiter = ',')]
     advertise: Vec<String>,
-    /// The node's name; a second worker of one name takes the first one's place [default: host name and process id].
+    /// The node's name; a second worker of one name takes the first one's place [default: host name and process id; in a secured
+    /// farm the identity's, which may be followed by /ANYTHING].
     #[arg(long, value_name = "NAME", env = "GLEANER_NAME")]
     name: Option<String>,
     /// A device to give: all | gpu:N | cpu | sim:score=1000,speed=1.0; repeat it for each (in the environment: semicolons)

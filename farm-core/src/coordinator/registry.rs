@@ -294,7 +294,10 @@ impl CoordinatorMachine {
     /// A second life of a node's name: the first is over at once. Jobs that the new one brought along stay with it.
     fn fence(&mut self, now: Instant, id: NodeId, hello: &NodeHello) {
         if let Some(link) = self.nodes.get(&id).and_then(|node| node.link) {
-            let reason = format!("{} of the same name took over", hello.session);
+            let reason = format!(
+                "another worker of the name {} took this one's place ({}); two on one machine need names of their own",
+                hello.name, hello.session
+            );
             self.effects.push_back(Effect::ToNode { link, message: CoordinatorToNode::Refused { reason } });
             self.close(link);
         }
