@@ -22,10 +22,10 @@ use std::{
 use farm_core::message::Liveness;
 use tokio::sync::watch;
 
-use crate::{StartError, store};
+use crate::{StartError, numbered::Numbered, store};
 
-/// A term's file, before its number.
-const PREFIX: &str = "leader-";
+/// The terms' files.
+const TERMS: Numbered = Numbered { before: "leader-", after: "" };
 /// Longest content of such a file that is read, in bytes.
 const MAX_CONTENT_BYTES: u64 = 512;
 /// How often a standby looks at the leader's beat.
@@ -73,9 +73,9 @@ impl Lead {
         let fault = |error: io::Error| store::fault(directory, &error);
         let term = match predecessor {
             Some(term) => term,
-            None => latest(directory).map_err(fault)?,
+            None => TERMS.latest(directory).map_err(fault)?,
         } + 1;
-        let path = path(directory, term);
+        let path = TERMS.path(directory, term);
         let made = OpenOptions::new().write(true).create_new(true).mode(0o600).open(&path);
         let file = made.map_err(|error| match error.kind() {
             io::ErrorKind::AlreadyExists => StartError::Outrun,
@@ -117,12 +117,7 @@ impl Lead {
     /// The coordinator serves: what is left of earlier terms goes.
     pub(crate) fn serves(&self) {
         self.serves.store(true, Ordering::Relaxed);
-        for term in terms(&self.directory).unwrap_or_default() {
-            if term < self.term {
-                // One that stays is looked at by nobody.
-                let _ = fs::remove_file(path(&self.directory, term));
-            }
-        }
+        TERMS.remove_before(&self.directory, self.term);
         store::forget_before(&self.directory, self.term);
     }
 
@@ -152,7 +147,7 @@ impl Lead {
     }
 
     fn is_over(&self) -> io::Result<bool> {
-        Ok(latest(&self.directory)? > self.term)
+        Ok(TERMS.latest(&self.directory)? > self.term)
     }
 
     fn write_beat(&self, beat: u64) -> io::Result<()> {
@@ -174,7 +169,7 @@ impl Drop for Lead {
             if let Some(copy) = self.copy.get() {
                 let _ = fs::remove_file(copy);
             }
-            let _ = fs::remove_file(path(&self.directory, self.term));
+            let _ = fs::remove_file(TERMS.path(&self.directory, self.term));
         }
     }
 }
@@ -246,11 +241,11 @@ struct Seen {
 
 impl Watch {
     fn look(&mut self) -> io::Result<Look> {
-        let term = latest(&self.directory)?;
+        let term = TERMS.latest(&self.directory)?;
         if term == 0 {
             return Ok(Look::Free(Vacancy { term, silent: false }));
         }
-        let file = match File::open(path(&self.directory, term)) {
+        let file = match File::open(TERMS.path(&self.directory, term)) {
             Ok(file) => file,
             // A successor has tidied up.
             Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(Look::Led),
@@ -319,28 +314,6 @@ fn line_of(file: &str) -> String {
     fs::read_to_string(file).unwrap_or_default().trim().to_owned()
 }
 
-fn path(directory: &Path, term: u64) -> PathBuf {
-    directory.join(format!("{PREFIX}{term}"))
-}
-
-/// The latest term; 0: there was none.
-fn latest(directory: &Path) -> io::Result<u64> {
-    Ok(terms(directory)?.into_iter().max().unwrap_or(0))
-}
-
-fn terms(directory: &Path) -> io::Result<Vec<u64>> {
-    let mut terms = Vec::new();
-    for entry in fs::read_dir(directory)? {
-        let name = entry?.file_name();
-        let term = name
-            .to_str()
-            .and_then(|name| name.strip_prefix(PREFIX))
-            .and_then(|term| term.parse::<u64>().ok());
-        terms.extend(term);
-    }
-    Ok(terms)
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -369,7 +342,7 @@ mod tests {
             "one follows"
         );
         second.serves();
-        assert_eq!(terms(directory.path()).unwrap(), [2]);
+        assert_eq!(TERMS.all(directory.path()).unwrap(), [2]);
         second.holds().unwrap();
     }
 
@@ -378,17 +351,17 @@ mod tests {
         let directory = tempfile::tempdir().unwrap();
         let first = Lead::take(directory.path(), None, soon()).unwrap();
         drop(Lead::take(directory.path(), Some(1), soon()).unwrap());
-        assert_eq!(terms(directory.path()).unwrap(), [1]);
+        assert_eq!(TERMS.all(directory.path()).unwrap(), [1]);
         first.holds().unwrap();
         let second = Lead::take(directory.path(), Some(1), soon()).unwrap();
         let third = Lead::take(directory.path(), Some(2), soon()).unwrap();
         third.serves();
         // Somebody who saw the first one end, and was stopped until now.
         assert!(matches!(Lead::take(directory.path(), Some(1), soon()), Err(StartError::Outrun)));
-        assert_eq!(terms(directory.path()).unwrap(), [3]);
+        assert_eq!(TERMS.all(directory.path()).unwrap(), [3]);
         third.holds().unwrap();
         drop(second);
-        assert_eq!(terms(directory.path()).unwrap(), [3], "it takes nothing of others back");
+        assert_eq!(TERMS.all(directory.path()).unwrap(), [3], "it takes nothing of others back");
     }
 
     #[tokio::test]
@@ -420,7 +393,7 @@ mod tests {
             boot: "another".to_owned(),
             holder: "process 1 of far".to_owned(),
         };
-        let file = path(directory.path(), 3);
+        let file = TERMS.path(directory.path(), 3);
         fs::write(&file, content.to_text()).unwrap();
         let silent = Vacancy { term: 3, silent: true };
         let began = Instant::now();

@@ -7,6 +7,7 @@ mod audit;
 mod identities;
 mod keeper;
 mod lead;
+mod numbered;
 mod owner;
 pub mod plugins;
 pub mod policy_host;

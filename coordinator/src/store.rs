@@ -29,14 +29,13 @@ use self::{
     projects::{BELONGING, PROJECTS},
     soft::{SPEEDS, STOPPED},
 };
-use crate::{StartError, lead::Lead};
+use crate::{StartError, lead::Lead, numbered::Numbered};
 
 /// The database in a state directory by which nobody has led yet; later ones have the term of their leader in the name.
 const FILE: &str = "control.redb";
-/// How those are named, before and after the term.
-const TERM_FILE: (&str, &str) = ("control-", ".redb");
-/// The ending of one that is not whole yet.
-const COPY: &str = "copy";
+/// Those, and what is not one yet.
+const DATABASES: Numbered = Numbered { before: "control-", after: ".redb" };
+const COPIES: Numbered = Numbered { before: "control-", after: ".copy" };
 /// What it keeps in memory, in bytes: it is read at joins and new sessions.
 const CACHE_BYTES: usize = 1 << 20;
 /// Where versions before the database kept the epoch.
@@ -127,9 +126,9 @@ impl Store {
     /// Opens the latest one; makes the directory and the database if they are not there. Refuses what another coordinator uses.
     pub(crate) fn open(directory: &Path) -> Result<Self, StartError> {
         fs::create_dir_all(directory).map_err(|error| fault(directory, &error))?;
-        let latest = || latest_term(directory).map_err(|error| fault(directory, &error));
+        let latest = || DATABASES.latest(directory).map_err(|error| fault(directory, &error));
         let term = latest()?;
-        let store = Self::open_at(directory, directory.join(file_of(term)))?;
+        let store = Self::open_at(directory, path_of(directory, term))?;
         // Somebody who leads since we looked has moved it, and we have made another one.
         if latest()? == term { Ok(store) } else { Err(StartError::InUse { path: directory.to_owned() }) }
     }
@@ -145,7 +144,7 @@ impl Store {
 
     /// Makes it the one of a term, which is later than all others: nobody else has it open.
     pub(crate) fn led_by(mut self, directory: &Path, lead: Arc<Lead>) -> Result<Self, StartError> {
-        let path = directory.join(file_of(lead.term()));
+        let path = path_of(directory, lead.term());
         let moved = fs::rename(&self.path, &path).and_then(|()| fs::File::open(directory)?.sync_all());
         moved.map_err(|error| fault(&self.path, &error))?;
         (self.path, self.lead) = (path, Some(lead));
@@ -155,10 +154,10 @@ impl Store {
     /// Opens a copy of the latest one, as that of a term: a predecessor may have the other open, and what it still writes there
     /// reaches nobody. It commits nothing that it says it did from when the term was taken (`Lead::holds`).
     pub(crate) fn copied_by(directory: &Path, lead: Arc<Lead>) -> Result<Self, StartError> {
-        let path = directory.join(file_of(lead.term()));
-        let copy = path.with_extension(COPY);
+        let path = path_of(directory, lead.term());
+        let copy = COPIES.path(directory, lead.term());
         let copied = || -> io::Result<()> {
-            let source = directory.join(file_of(latest_term(directory)?));
+            let source = path_of(directory, DATABASES.latest(directory)?);
             // What a start left behind that came no further is the only one, and stays.
             if source != path {
                 lead.copies_to(&path);
@@ -539,39 +538,14 @@ fn everything(database: &Database) -> Result<Vec<Entry>, redb::Error> {
 }
 
 /// The database of a term; 0: before the first.
-fn file_of(term: u64) -> String {
-    let (before, after) = TERM_FILE;
-    if term == 0 { FILE.to_owned() } else { format!("{before}{term}{after}") }
+fn path_of(directory: &Path, term: u64) -> PathBuf {
+    if term == 0 { directory.join(FILE) } else { DATABASES.path(directory, term) }
 }
 
-/// The term of a database's file.
-fn term_of(name: &str) -> Option<u64> {
-    let (before, after) = TERM_FILE;
-    let term: u64 = name.strip_prefix(before)?.strip_suffix(after)?.parse().ok()?;
-    // Another spelling of a number is not ours.
-    (file_of(term) == name).then_some(term)
-}
-
-/// The term of the latest database.
-fn latest_term(directory: &Path) -> io::Result<u64> {
-    let mut latest = 0;
-    for entry in fs::read_dir(directory)? {
-        latest = latest.max(entry?.file_name().to_str().and_then(term_of).unwrap_or(0));
-    }
-    Ok(latest)
-}
-
-/// Removes the databases of terms before this one; what stays is looked at by nobody.
+/// Removes the databases of terms before this one.
 pub(crate) fn forget_before(directory: &Path, term: u64) {
-    let Ok(entries) = fs::read_dir(directory) else { return };
-    for name in entries.flatten().map(|entry| entry.file_name()) {
-        let Some(name) = name.to_str() else { continue };
-        let whole = name.strip_suffix(COPY).and_then(|name| name.strip_suffix('.'));
-        let of = whole.map_or_else(|| term_of(name), |name| term_of(&format!("{name}{}", TERM_FILE.1)));
-        if of.is_some_and(|of| of < term) {
-            let _ = fs::remove_file(directory.join(name));
-        }
-    }
+    DATABASES.remove_before(directory, term);
+    COPIES.remove_before(directory, term);
 }
 
 fn is_operator(uri: &str) -> bool {
