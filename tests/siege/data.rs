@@ -16,7 +16,7 @@ use farm_core::{
     message::{AppToNode, PROTOCOL_VERSION},
 };
 use proto::{
-    link::{BULK_STREAMS, FETCH_STREAMS, LINK_WINDOW_BYTES, MAX_PAYLOAD_BYTES, encode_frame},
+    link::{BULK_STREAMS, FETCH_STREAMS, Header as _, LINK_WINDOW_BYTES, encode_frame},
     trust::{Authority, IDENTITY_LIFETIME, Role},
 };
 use quinn::{
@@ -46,6 +46,8 @@ pub(crate) const STREAM_LINKS: u64 = 8;
 pub(crate) const ANNOUNCING_LINKS: u64 = 16;
 /// Links with as much of such frames as a link takes unread.
 pub(crate) const STALLED_LINKS: u64 = 2;
+/// How long a link of the latter stays, once it has sent that; then it comes again.
+const STALL: Duration = Duration::from_secs(1);
 /// Datagrams between two looks at what else there is to do.
 const BURST: u64 = 64;
 /// Between two rounds of half handshakes: less than a node's patience with one.
@@ -329,41 +331,44 @@ pub(crate) async fn broken_frames(target: Target, tally: Tally) {
     }
 }
 
-/// Frames as large as they may be, of which a byte comes.
+/// Frames as large as they may be, of which a byte comes. The links stay as long as the node keeps them.
 pub(crate) async fn announcements(target: Target, tally: Tally) {
-    hold(target, tally, ANNOUNCING_LINKS, 1).await;
+    begin_frames(target, tally, ANNOUNCING_LINKS, 1, Duration::MAX).await;
 }
 
-/// The same, of which as much comes as a link takes unread.
+/// The same, of which as much comes as a link takes unread. The links end, and come again.
 pub(crate) async fn stalled(target: Target, tally: Tally) {
     let share = (LINK_WINDOW_BYTES / BULK_STREAMS) as usize;
-    hold(target, tally, STALLED_LINKS, share).await;
+    begin_frames(target, tally, STALLED_LINKS, share, STALL).await;
 }
 
-/// Keeps links on which all streams have begun a frame and go no further.
-async fn hold(target: Target, tally: Tally, links: u64, sent: usize) {
-    let beginning = [&[BULK], &lengths(16, MAX_PAYLOAD_BYTES)[..], &vec![0; sent]].concat();
-    let mut held = JoinSet::new();
+/// Has links on each of which all streams begin a frame, send so much of it, and go no further for so long.
+async fn begin_frames(target: Target, tally: Tally, links: u64, sent: usize, stall: Duration) {
+    let beginning = [&[BULK], &lengths(16, AppToNode::MAX_PAYLOAD_BYTES)[..], &vec![0; sent]].concat();
+    let mut ends = JoinSet::new();
     for _ in 0..links {
         let (endpoint, tally, beginning) = (stranger(), tally.clone(), beginning.clone());
-        held.spawn(async move {
+        ends.spawn(async move {
             loop {
                 tally.add(1);
                 let Some(connection) = dial(&endpoint, target.data).await else { continue };
                 let Some(_ordered) = greet(&connection).await else { continue };
-                let mut streams = JoinSet::new();
+                let mut begun = JoinSet::new();
                 for _ in 0..BULK_STREAMS {
                     let (connection, beginning) = (connection.clone(), beginning.clone());
-                    streams.spawn(async move {
+                    begun.spawn(async move {
                         let mut stream = connection.open_uni().await.ok()?;
                         stream.write_all(&beginning).await.ok()?;
-                        connection.closed().await;
-                        Some(())
+                        Some(stream)
                     });
                 }
-                while streams.join_next().await.is_some() {}
+                let mut streams = Vec::new();
+                while let Some(stream) = begun.join_next().await {
+                    streams.push(stream);
+                }
+                let _ = timeout(stall, connection.closed()).await;
             }
         });
     }
-    while held.join_next().await.is_some() {}
+    while ends.join_next().await.is_some() {}
 }

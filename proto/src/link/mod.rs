@@ -28,7 +28,10 @@ use std::{
 };
 
 use bytes::Bytes;
-use farm_core::id::ContentHash;
+use farm_core::{
+    id::ContentHash,
+    message::{AppToNode, NodeToApp},
+};
 use serde::{Serialize, de::DeserializeOwned};
 use thiserror::Error;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
@@ -43,12 +46,10 @@ pub use self::{
     send::{LinkSender, TrySendError},
     wire::{decode_frames, encode_frame},
 };
-use crate::codec::CodecError;
+use crate::codec::{CodecError, MAX_PROGRAM_BYTES};
 
 /// Frames with at most this much payload share the ordered stream, in bytes.
 pub const SMALL_PAYLOAD_BYTES: usize = 64 << 10;
-/// Most payload of one frame, in bytes: the most a program may yield (`ProgramQuota::result_bytes`).
-pub const MAX_PAYLOAD_BYTES: u64 = 1 << 30;
 /// Most bytes of one content (task allocation or module).
 pub const MAX_CONTENT_BYTES: u64 = 16 << 30;
 /// Frames that wait to be sent on one link, and received frames that wait to be read: at most this many each.
@@ -58,10 +59,21 @@ pub const BULK_STREAMS: u32 = 8;
 /// Content fetches on the way at once on one link; further ones wait.
 pub const FETCH_STREAMS: u32 = 8;
 
-/// What can be a frame's header: `farm_core`'s `AppToNode` and `NodeToApp`.
-pub trait Header: Serialize + DeserializeOwned + fmt::Debug + Send + Sync + 'static {}
+/// What can be a frame's header.
+pub trait Header: Serialize + DeserializeOwned + fmt::Debug + Send + Sync + 'static {
+    /// Most payload of one such frame, in bytes.
+    const MAX_PAYLOAD_BYTES: u64;
+}
 
-impl<H: Serialize + DeserializeOwned + fmt::Debug + Send + Sync + 'static> Header for H {}
+impl Header for AppToNode {
+    /// One program; several go in smaller frames.
+    const MAX_PAYLOAD_BYTES: u64 = MAX_PROGRAM_BYTES as u64;
+}
+
+impl Header for NodeToApp {
+    /// The most a program may yield (`ProgramQuota::result_bytes`).
+    const MAX_PAYLOAD_BYTES: u64 = 1 << 30;
+}
 
 /// One received frame.
 #[derive(Clone, Debug, PartialEq, Eq)]

@@ -13,7 +13,7 @@ use quinn::{ReadError, RecvStream};
 use tokio::sync::{mpsc, watch};
 
 use super::{
-    Frame, Header, LinkError, MAX_PAYLOAD_BYTES, QUEUED_FRAMES, SMALL_PAYLOAD_BYTES,
+    Frame, Header, LinkError, QUEUED_FRAMES, SMALL_PAYLOAD_BYTES,
     shared::{Guard, Shared},
     wire::{self, Lengths, PREFIX_BYTES, protocol, split_frame},
 };
@@ -213,7 +213,7 @@ async fn read_bulk<R: Header>(inbox: &Inbox<R>, mut input: Input) -> Result<(), 
     }
     let mut buffer = BytesMut::with_capacity(PREFIX_BYTES);
     let lengths = loop {
-        if let Some(lengths) = Lengths::parse(&buffer, MAX_PAYLOAD_BYTES)? {
+        if let Some(lengths) = Lengths::parse(&buffer, R::MAX_PAYLOAD_BYTES)? {
             break lengths;
         }
         if !input.read_into(&mut buffer).await? {

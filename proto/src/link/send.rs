@@ -9,8 +9,8 @@ use thiserror::Error;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc, oneshot};
 
 use super::{
-    Arrived, BULK_STREAMS, ContentBytes, FetchError, Header, LinkError, MAX_PAYLOAD_BYTES, QUEUED_FRAMES,
-    SMALL_PAYLOAD_BYTES, fetch,
+    Arrived, BULK_STREAMS, ContentBytes, FetchError, Header, LinkError, QUEUED_FRAMES, SMALL_PAYLOAD_BYTES,
+    fetch,
     shared::{Guard, Shared},
     wire,
 };
@@ -78,7 +78,7 @@ impl<S: Header> LinkSender<S> {
     /// # Errors
     /// The link is over, or the payload is over its cap.
     pub async fn send(&self, header: S, payload: Vec<Bytes>) -> Result<(), LinkError> {
-        if payload_bytes(&payload)? <= SMALL_PAYLOAD_BYTES {
+        if payload_bytes::<S>(&payload)? <= SMALL_PAYLOAD_BYTES {
             return self.queue.send(Queued::Frame(header, payload)).await.map_err(|_| self.guard.error());
         }
         // The semaphore is never closed; the permit comes back when the peer has the frame or the link is over.
@@ -91,7 +91,7 @@ impl<S: Header> LinkSender<S> {
     /// # Errors
     /// The queue is full (the frame comes back), the link is over, or the payload is over its cap.
     pub fn try_send(&self, header: S, payload: Vec<Bytes>) -> Result<(), TrySendError<S>> {
-        if payload_bytes(&payload).map_err(TrySendError::Link)? <= SMALL_PAYLOAD_BYTES {
+        if payload_bytes::<S>(&payload).map_err(TrySendError::Link)? <= SMALL_PAYLOAD_BYTES {
             return self.queue.try_send(Queued::Frame(header, payload)).map_err(|error| match error {
                 mpsc::error::TrySendError::Full(Queued::Frame(header, payload)) => {
                     TrySendError::Full(header, payload)
@@ -178,12 +178,11 @@ impl<S> LinkSender<S> {
     }
 }
 
-fn payload_bytes(payload: &[Bytes]) -> Result<usize, LinkError> {
+fn payload_bytes<S: Header>(payload: &[Bytes]) -> Result<usize, LinkError> {
     let bytes: usize = payload.iter().map(Bytes::len).sum();
-    if bytes as u64 > MAX_PAYLOAD_BYTES {
-        return Err(LinkError::Frame {
-            reason: format!("payload of {bytes} B is over {MAX_PAYLOAD_BYTES} B"),
-        });
+    let cap = S::MAX_PAYLOAD_BYTES;
+    if bytes as u64 > cap {
+        return Err(LinkError::Frame { reason: format!("payload of {bytes} B is over {cap} B") });
     }
     Ok(bytes)
 }

@@ -21,8 +21,8 @@ use farm_core::{
 use quinn::{Connection, SendStream};
 
 use super::{
-    Arrived, ConnectError, ContentBytes, ContentSource, DataServer, FetchError, Frame, Link, LinkError,
-    MAX_CONTENT_BYTES, MAX_PAYLOAD_BYTES, PIECE_BYTES, SMALL_PAYLOAD_BYTES, TrySendError, connect,
+    Arrived, ConnectError, ContentBytes, ContentSource, DataServer, FetchError, Frame, Header as _, Link,
+    LinkError, MAX_CONTENT_BYTES, PIECE_BYTES, SMALL_PAYLOAD_BYTES, TrySendError, connect,
     connect::dial,
     wire::{BULK_STREAM, ORDERED_STREAM},
 };
@@ -384,7 +384,7 @@ async fn hostile_streams_end_the_link_with_a_reason() {
         ("header length over its cap", lengths(ORDERED_STREAM, header_cap + 1, 0)),
         ("all-ones lengths", lengths(ORDERED_STREAM, u32::MAX, u64::MAX)),
         ("small payload over its cap", lengths(ORDERED_STREAM, 1, SMALL_PAYLOAD_BYTES as u64 + 1)),
-        ("large payload over its cap", lengths(BULK_STREAM, 1, MAX_PAYLOAD_BYTES + 1)),
+        ("large payload over its cap", lengths(BULK_STREAM, 1, AppToNode::MAX_PAYLOAD_BYTES + 1)),
         ("all-ones bulk payload", lengths(BULK_STREAM, 1, u64::MAX)),
         ("a torn frame", torn),
         ("a header that does not decode", garbage),

@@ -3,7 +3,7 @@
 
 use bytes::{Buf as _, BufMut, Bytes, BytesMut};
 
-use super::{Frame, Header, LinkError, MAX_PAYLOAD_BYTES};
+use super::{Frame, Header, LinkError};
 use crate::codec::{self, CodecError, MAX_HEADER_BYTES};
 
 /// First byte of the one stream of small frames.
@@ -31,7 +31,7 @@ pub fn encode_frame<S: Header>(header: &S, payload: &[Bytes]) -> Result<Bytes, C
 pub fn decode_frames<R: Header>(bytes: Bytes) -> Result<Vec<Frame<R>>, LinkError> {
     let mut buffer = BytesMut::from(bytes);
     let mut frames = Vec::new();
-    while let Some(lengths) = Lengths::parse(&buffer, MAX_PAYLOAD_BYTES)? {
+    while let Some(lengths) = Lengths::parse(&buffer, R::MAX_PAYLOAD_BYTES)? {
         if buffer.len() < lengths.frame_bytes() {
             break;
         }
@@ -58,7 +58,7 @@ impl Lengths {
         if header as usize > MAX_HEADER_BYTES {
             return Err(protocol(format!("header of {header} B is over {MAX_HEADER_BYTES} B")));
         }
-        if payload > payload_cap.min(MAX_PAYLOAD_BYTES) {
+        if payload > payload_cap {
             return Err(protocol(format!("payload of {payload} B is over {payload_cap} B")));
         }
         let payload = usize::try_from(payload).map_err(|_| protocol(format!("payload of {payload} B")))?;
