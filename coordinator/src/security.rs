@@ -238,7 +238,7 @@ impl Security {
 
     /// Writes down what an operator was refused; a store that fails refuses nobody.
     fn denied(&self, what: &str, operator: &Member, error: &StoreError) {
-        if let StoreError::Denied(reason) = error {
+        if let StoreError::Denied(reason) | StoreError::Refused(reason) = error {
             self.audit.refused(what, &operator.principal.to_string(), reason);
         }
     }
@@ -558,6 +558,7 @@ async fn on_disk<T: Send + 'static>(
     match tokio::task::spawn_blocking(work).await {
         Ok(Ok(done)) => Ok(done),
         Ok(Err(StoreError::Denied(reason))) => Err(Status::permission_denied(reason)),
+        Ok(Err(StoreError::Refused(reason))) => Err(Status::failed_precondition(reason)),
         Ok(Err(error @ (StoreError::Broken(_) | StoreError::Superseded(_)))) => {
             tracing::error!(%error, "a request failed");
             Err(Status::internal(error.to_string()))

@@ -81,6 +81,11 @@ fn is_denied<T>(outcome: Result<T, SessionError>) -> bool {
     matches!(outcome, Err(SessionError::Denied { .. }))
 }
 
+/// It is no matter of rights.
+fn is_refused<T>(outcome: Result<T, SessionError>) -> bool {
+    matches!(outcome, Err(SessionError::Refused { .. }))
+}
+
 #[tokio::test(flavor = "multi_thread")]
 async fn each_role_may_do_what_the_matrix_says_and_nothing_else() {
     let farm = Farm::start().await;
@@ -154,7 +159,7 @@ async fn a_token_lets_in_whom_it_is_for_once() {
     assert_eq!(joined.principal().to_string(), "gleaner://farm/node/gpu-1");
     assert!(is_denied(control::join(address, &for_a_name, None).await), "once");
     let any_name = token(address, &farm.operator, &invitation(Role::Node, None)).await;
-    assert!(is_denied(control::join(address, &any_name, Some("gpu-1")).await), "the name is somebody's");
+    assert!(is_refused(control::join(address, &any_name, Some("gpu-1")).await), "the name is somebody's");
 
     let (id, revoked) =
         control::create_token(address, Some(&farm.operator), &invitation(Role::App, None)).await.unwrap();
@@ -241,21 +246,21 @@ async fn a_member_is_of_its_tokens_project_and_the_quota_outlives_the_coordinato
     let operator = Some(&farm.operator);
     let films = Invitation { project: Some("films".to_owned()), ..invitation(Role::App, None) };
     let refused = control::create_token(&farm.address, operator, &films).await;
-    assert!(is_denied(refused), "a slip in a name makes no project");
+    assert!(is_refused(refused), "a slip in a name makes no project");
     let change = QuotaChange { bytes: Some(Some(100)), weight: Some(Some(0.5)), ..QuotaChange::default() };
     let quota = control::set_project(&farm.address, operator, "films", change).await.unwrap();
     assert_eq!((quota.bytes, quota.weight, quota.devices), (Some(100), Some(0.5), None));
     let of_a_node = Invitation { role: Role::Node, ..films.clone() };
     let refused = control::create_token(&farm.address, operator, &of_a_node).await;
-    assert!(matches!(refused, Err(SessionError::Refused { .. })), "{refused:?}");
+    assert!(is_refused(refused));
     let bad = QuotaChange { weight: Some(Some(f64::NAN)), ..QuotaChange::default() };
     let refused = control::set_project(&farm.address, operator, "films", bad).await;
-    assert!(matches!(refused, Err(SessionError::Refused { .. })), "{refused:?}");
+    assert!(is_refused(refused));
 
     let token = token(&farm.address, &farm.operator, &films).await;
     let artist = control::join(&farm.address, &token, Some("artist")).await.unwrap();
     let in_use = control::remove_project(&farm.address, operator, "films").await;
-    let says_who = matches!(&in_use, Err(SessionError::Denied { reason }) if reason.contains("app/artist"));
+    let says_who = matches!(&in_use, Err(SessionError::Refused { reason }) if reason.contains("app/artist"));
     assert!(says_who, "{in_use:?}");
     let (session, who, given) = app(&farm.address, &artist, None, &[]).await.unwrap();
     let (_other, ..) = app(&farm.address, &farm.app, None, &[]).await.unwrap();
@@ -437,7 +442,7 @@ async fn who_is_out_is_out_at_once_and_so_is_whom_they_invited() {
         "its tokens are taken back"
     );
     let last = control::expel(&farm.address, operator, &farm.operator.principal().to_string()).await;
-    assert!(is_denied(last), "the last operator stays");
+    assert!(is_refused(last), "the last operator stays");
 
     let old_token = token(&farm.address, &farm.operator, &invitation(Role::Operator, None)).await;
     let Farm { state, handle, operator, .. } = farm;

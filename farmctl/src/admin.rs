@@ -125,7 +125,7 @@ impl Admin {
 }
 
 /// A request that is refused for what it says is a wrong usage.
-fn usage(error: SessionError) -> Failure {
+pub(crate) fn usage(error: SessionError) -> Failure {
     match error {
         SessionError::Refused { .. } => Failure::Usage(error.into()),
         error => failure(error),

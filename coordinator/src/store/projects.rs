@@ -23,7 +23,7 @@ impl Store {
             // The one that is always there counts as none.
             let is_new = before.is_none() && name != DEFAULT_PROJECT;
             if is_new && projects.len().map_err(broken)? >= MAX_PROJECTS as u64 {
-                return Err(StoreError::Denied(format!("{MAX_PROJECTS} projects are there already")));
+                return Err(StoreError::Refused(format!("{MAX_PROJECTS} projects are there already")));
             }
             let after = change.apply(before.unwrap_or_default());
             let text =
@@ -37,14 +37,14 @@ impl Store {
     pub(crate) fn remove_project(&self, name: &str, now_s: u64) -> Result<bool, StoreError> {
         if name == DEFAULT_PROJECT {
             let reason = "the project default stays; `farmctl project set default` lifts its bounds";
-            return Err(StoreError::Denied(reason.to_owned()));
+            return Err(StoreError::Refused(reason.to_owned()));
         }
         self.write(|transaction| {
             for entry in transaction.open_table(BELONGING).map_err(broken)?.iter().map_err(broken)? {
                 let (member, project) = entry.map_err(broken)?;
                 if project.value() == name {
                     let member = member.value();
-                    return Err(StoreError::Denied(format!(
+                    return Err(StoreError::Refused(format!(
                         "the project {name} stays: {member} belongs to it"
                     )));
                 }
@@ -53,7 +53,7 @@ impl Store {
                 let token = parse(entry.map_err(broken)?.1.value())?;
                 if token.project == name && token.expires_s > now_s {
                     let id = token.id;
-                    return Err(StoreError::Denied(format!(
+                    return Err(StoreError::Refused(format!(
                         "the project {name} stays: token {id} is for it"
                     )));
                 }
@@ -111,7 +111,7 @@ pub(super) fn check_known(transaction: &WriteTransaction, project: &str) -> Resu
     if projects.get(project).map_err(broken)?.is_some() {
         return Ok(());
     }
-    Err(StoreError::Denied(format!(
+    Err(StoreError::Refused(format!(
         "there is no project {project:?}: `farmctl project set {project}` makes it"
     )))
 }
