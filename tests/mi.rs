@@ -124,6 +124,15 @@ fn a_run_with_a_journal_goes_on_from_it_with_the_same_bytes() {
     let (status, stderr) =
         start(&farm, &input, &out("resumed"), &[&resume[..], &["--seed", "2"]].concat()).finish();
     assert_eq!(status.code(), Some(2), "another seed is another run; stderr:\n{stderr}");
+    let sums = out("resumed").join("sums.bin");
+    for others in [["--iterations", "20", "--seed", "2"], ["--iterations", "201", "--seed", "1"]] {
+        let folder = out(others[1]);
+        finish(start(&farm, &input, &folder, &others));
+        fs::copy(folder.join("sums.bin"), &sums).expect("the sums are there");
+        let (status, stderr) = start(&farm, &input, &out("resumed"), &resume).finish();
+        assert!(!status.success() && stderr.contains("sums.bin"), "{others:?}; stderr:\n{stderr}");
+        fs::remove_file(&sums).expect("it is left as it was");
+    }
 
     let mut run = start(&farm, &input, &out("resumed"), &resume);
     let summary = run.wait_for(|line| line["event"] == "done");

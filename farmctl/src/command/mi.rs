@@ -179,7 +179,18 @@ fn read(arguments: &MiArgs) -> Result<Input, Failure> {
     let path = arguments.folder.join(SUMS);
     let earlier = match (fs::read(&path), arguments.extend) {
         // Written by the run that the journal is of, which ended before it could remove it: the same sums will follow.
-        (Ok(_), false) if arguments.resume && journal_path(arguments).exists() => None,
+        (Ok(sums), false) if arguments.resume && journal_path(arguments).exists() => {
+            let there = saved::load(&alignment, Seed(arguments.seed), &sums).with_context(|| shown(&path))?;
+            if there.iterations() as u64 > arguments.iterations {
+                let reason = anyhow!(
+                    "{} has {} iterations: another run's, which is not written over",
+                    shown(&path),
+                    there.iterations()
+                );
+                return Err(Failure::Usage(reason));
+            }
+            None
+        }
         (Ok(_), false) => {
             let reason = anyhow!(
                 "{} is there already: --extend goes on from it, another folder begins anew",
