@@ -5,6 +5,8 @@
 //! once where the leader was a process of this system that has let go of its lock. A leader that has not written its beat for three
 //! quarters of that time commits nothing any more, and one that sees a later term ends.
 
+mod standbys;
+
 use std::{
     fs::{self, File, OpenOptions},
     io::{self, Read as _},
@@ -22,6 +24,8 @@ use std::{
 use farm_core::message::Liveness;
 use tokio::sync::watch;
 
+use self::standbys::Presence;
+pub(crate) use self::standbys::Standbys;
 use crate::{StartError, numbered::Numbered, store};
 
 /// The terms' files.
@@ -56,6 +60,7 @@ pub(crate) struct Lead {
     /// Whether there is a later term.
     over: watch::Sender<bool>,
     serves: AtomicBool,
+    standbys: Arc<Standbys>,
     /// Its control store, if that is a copy of the one of a leader that may go on.
     copy: OnceLock<PathBuf>,
 }
@@ -91,6 +96,7 @@ impl Lead {
             renewed: Mutex::new(Instant::now()),
             over,
             serves: AtomicBool::new(false),
+            standbys: Arc::default(),
             copy: OnceLock::new(),
         });
         lead.file.lock().map_err(|error| store::fault(&path, &error))?;
@@ -106,6 +112,11 @@ impl Lead {
 
     pub(crate) const fn term(&self) -> u64 {
         self.term
+    }
+
+    /// Who would take over.
+    pub(crate) fn standbys(&self) -> Arc<Standbys> {
+        Arc::clone(&self.standbys)
     }
 
     /// The control store of this term is a copy, or will be.
@@ -152,8 +163,7 @@ impl Lead {
 
     fn write_beat(&self, beat: u64) -> io::Result<()> {
         let before = Instant::now();
-        let content =
-            Content { beat, dead_ms: self.liveness.dead_ms, boot: line_of(BOOT_FILE), holder: holder() };
+        let content = Content::new(beat, self.liveness);
         self.file.write_all_at(content.to_text().as_bytes(), 0)?;
         // Other systems see it through a network's disk.
         self.file.sync_data()?;
@@ -201,6 +211,7 @@ fn beat(lead: &Weak<Lead>) {
             }
             Err(_) => {}
         }
+        lead.standbys.look(&lead.directory);
     }
 }
 
@@ -209,7 +220,12 @@ fn beat(lead: &Weak<Lead>) {
 /// # Errors
 /// The directory cannot be used, or is not there: on a disk that is not mounted, another farm would begin.
 pub async fn stand_by(directory: &Path, liveness: Liveness) -> Result<Vacancy, StartError> {
-    let mut watch = Watch { directory: directory.to_owned(), own_dead_ms: liveness.dead_ms, seen: None };
+    let mut watch = Watch {
+        directory: directory.to_owned(),
+        own_dead_ms: liveness.dead_ms,
+        seen: None,
+        presence: Presence::new(directory, liveness),
+    };
     loop {
         let looked = tokio::task::spawn_blocking(move || (watch.look(), watch)).await;
         let look;
@@ -231,6 +247,7 @@ struct Watch {
     directory: PathBuf,
     own_dead_ms: u64,
     seen: Option<Seen>,
+    presence: Presence,
 }
 
 struct Seen {
@@ -245,15 +262,14 @@ impl Watch {
         if term == 0 {
             return Ok(Look::Free(Vacancy { term, silent: false }));
         }
+        self.presence.show()?;
         let file = match File::open(TERMS.path(&self.directory, term)) {
             Ok(file) => file,
             // A successor has tidied up.
             Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(Look::Led),
             Err(error) => return Err(error),
         };
-        let mut text = Vec::new();
-        (&file).take(MAX_CONTENT_BYTES).read_to_end(&mut text)?;
-        let text = String::from_utf8_lossy(&text).into_owned();
+        let text = text_of(&file)?;
         let content = Content::parse(&text);
         let seen = match self.seen.take() {
             Some(seen) if seen.term == term && seen.text == text => seen,
@@ -282,10 +298,16 @@ impl Watch {
     }
 }
 
-/// What is in a term's file: of one length for as long as its leader lives.
+fn text_of(file: &File) -> io::Result<String> {
+    let mut text = Vec::new();
+    file.take(MAX_CONTENT_BYTES).read_to_end(&mut text)?;
+    Ok(String::from_utf8_lossy(&text).into_owned())
+}
+
+/// What is in the file of a leader or a standby: of one length for as long as it lives.
 struct Content {
     beat: u64,
-    /// After how long a silence the leader counts as gone, in milliseconds.
+    /// After how long a silence it counts as gone, in milliseconds.
     dead_ms: u64,
     boot: String,
     /// For people.
@@ -293,6 +315,11 @@ struct Content {
 }
 
 impl Content {
+    /// This process's.
+    fn new(beat: u64, liveness: Liveness) -> Self {
+        Self { beat, dead_ms: liveness.dead_ms, boot: line_of(BOOT_FILE), holder: holder() }
+    }
+
     fn to_text(&self) -> String {
         let Self { beat, dead_ms, boot, holder } = self;
         format!("{beat:020} {dead_ms:020} {boot} {holder}\n")

@@ -274,7 +274,8 @@ pub async fn start(options: CoordinatorOptions) -> Result<CoordinatorHandle, Sta
         ..CoordinatorConfig::new(epoch, random_seed())
     };
 
-    let (owner, commands) = OwnerHandle::new();
+    let lead = store.as_ref().and_then(|store| store.lead());
+    let (owner, commands) = OwnerHandle::new(lead.map(|lead| lead.standbys()).unwrap_or_default());
     let (stop_owner, owner_stops) = oneshot::channel();
     let (stop_servers, servers_stop) = watch::channel(());
     let incoming = match &gate {
@@ -297,7 +298,7 @@ pub async fn start(options: CoordinatorOptions) -> Result<CoordinatorHandle, Sta
         tokio::spawn(Owner::new(machine, plugins, keeper, gate.clone()).run(commands, owner_stops));
     let grpc_task = tokio::spawn(serve_grpc(incoming, owner.clone(), gate, servers_stop.clone()));
     let http_task = tokio::spawn(serve_http(http, owner.clone(), servers_stop));
-    if let Some(lead) = store.as_ref().and_then(|store| store.lead()) {
+    if let Some(lead) = lead {
         lead.serves();
     }
     tracing::info!(%epoch, grpc = %grpc_addr, http = %http_addr, secured = options.secured, "coordinator started");

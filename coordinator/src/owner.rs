@@ -2,7 +2,7 @@
 //!
 //! It never waits for a peer: a peer whose queue is full does not read, and loses its connection.
 
-use std::{collections::HashMap, time::Duration};
+use std::{collections::HashMap, sync::Arc, time::Duration};
 
 use farm_core::{
     coordinator::{
@@ -24,6 +24,7 @@ use tonic::Status;
 use crate::{
     identities::Identities,
     keeper::Keeper,
+    lead::Standbys,
     plugins::{Answered, Plugins},
     security::Gate,
 };
@@ -323,7 +324,10 @@ fn in_scope(peer: &Peer<CoordinatorToApp>, mut message: AppToCoordinator) -> App
 
 /// Talks to the owner; cloneable.
 #[derive(Clone, Debug)]
-pub(crate) struct OwnerHandle(mpsc::Sender<Command>);
+pub(crate) struct OwnerHandle {
+    commands: mpsc::Sender<Command>,
+    standbys: Arc<Standbys>,
+}
 
 impl std::fmt::Debug for Command {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
@@ -333,71 +337,72 @@ impl std::fmt::Debug for Command {
 
 impl OwnerHandle {
     /// The handle and the queue for [`Owner::run`].
-    pub(crate) fn new() -> (Self, mpsc::Receiver<Command>) {
+    pub(crate) fn new(standbys: Arc<Standbys>) -> (Self, mpsc::Receiver<Command>) {
         let (commands, queue) = mpsc::channel(QUEUED_COMMANDS);
-        (Self(commands), queue)
+        (Self { commands, standbys }, queue)
     }
 
     /// Waits while the owner is busy; false once it has stopped.
     pub(crate) async fn send(&self, command: Command) -> bool {
-        self.0.send(command).await.is_ok()
+        self.commands.send(command).await.is_ok()
     }
 
     /// `None` once the owner has stopped.
     pub(crate) async fn status(&self) -> Option<FarmStatus> {
         let (answer, status) = oneshot::channel();
-        self.0.send(Command::Status(answer)).await.ok()?;
-        status.await.ok()
+        self.commands.send(Command::Status(answer)).await.ok()?;
+        let status = status.await.ok()?;
+        Some(FarmStatus { standbys: self.standbys.present(), ..status })
     }
 
     /// Whether there is such a node; `None` once the owner has stopped.
     pub(crate) async fn drain(&self, node: NodeId) -> Option<bool> {
         let (answer, known) = oneshot::channel();
-        self.0.send(Command::Drain(node, answer)).await.ok()?;
+        self.commands.send(Command::Drain(node, answer)).await.ok()?;
         known.await.ok()
     }
 
     /// `None` once the owner has stopped.
     pub(crate) async fn contents(&self) -> Option<ContentsStatus> {
         let (answer, contents) = oneshot::channel();
-        self.0.send(Command::Contents(answer)).await.ok()?;
+        self.commands.send(Command::Contents(answer)).await.ok()?;
         contents.await.ok()
     }
 
     /// Whether there is such a node; `None` once the owner has stopped.
     pub(crate) async fn evict(&self, node: Option<NodeId>, contents: Vec<ContentHash>) -> Option<bool> {
         let (answer, known) = oneshot::channel();
-        self.0.send(Command::Evict(node, contents, answer)).await.ok()?;
+        self.commands.send(Command::Evict(node, contents, answer)).await.ok()?;
         known.await.ok()
     }
 
     /// `None` once the owner has stopped.
     pub(crate) async fn timeline(&self, query: TimelineQuery) -> Option<Timeline> {
         let (answer, timeline) = oneshot::channel();
-        self.0.send(Command::Timeline(query, answer)).await.ok()?;
+        self.commands.send(Command::Timeline(query, answer)).await.ok()?;
         timeline.await.ok()
     }
 
     /// Has a project's quota count.
     pub(crate) async fn quota_set(&self, project: String, quota: Quota) {
         // An owner that has stopped has no projects.
-        let _ = self.0.send(Command::QuotaSet(project, quota)).await;
+        let _ = self.commands.send(Command::QuotaSet(project, quota)).await;
     }
 
     /// Forgets a project.
     pub(crate) async fn project_removed(&self, project: String) {
-        let _ = self.0.send(Command::ProjectRemoved(project)).await;
+        let _ = self.commands.send(Command::ProjectRemoved(project)).await;
     }
 
     /// Ends the sessions of those who are no members any more.
     pub(crate) async fn members_changed(&self) {
         // An owner that has stopped has no sessions.
-        let _ = self.0.send(Command::MembersChanged).await;
+        let _ = self.commands.send(Command::MembersChanged).await;
     }
 
     /// Waits until the owner has stopped.
     pub(crate) async fn stopped(&self) {
-        self.0.closed().await;
+        self.commands.closed().await;
     }
 }
 
@@ -413,7 +418,7 @@ mod tests {
 
     #[tokio::test]
     async fn a_peer_that_does_not_read_is_closed_and_holds_nobody_up() {
-        let (owner, commands) = OwnerHandle::new();
+        let (owner, commands) = OwnerHandle::new(Arc::default());
         let (_stop, stopped) = oneshot::channel();
         let machine = CoordinatorMachine::new(CoordinatorConfig::new(Epoch(1), 7));
         tokio::spawn(Owner::new(machine, Plugins::none(), Keeper::none(), Gate::Open).run(commands, stopped));
@@ -465,7 +470,7 @@ mod tests {
 
     #[tokio::test]
     async fn the_owner_stops_when_told() {
-        let (owner, commands) = OwnerHandle::new();
+        let (owner, commands) = OwnerHandle::new(Arc::default());
         let (stop, stopped) = oneshot::channel();
         let machine = CoordinatorMachine::new(CoordinatorConfig::new(Epoch(1), 7));
         let task = tokio::spawn(

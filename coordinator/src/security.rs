@@ -608,7 +608,7 @@ mod tests {
         let identity = initialise(directory.path(), "farm", "boss").unwrap();
         let store = Arc::new(Store::open(directory.path()).unwrap());
         let security = Security::open(directory.path(), Arc::clone(&store)).unwrap();
-        let (owner, mut commands) = OwnerHandle::new();
+        let (owner, mut commands) = OwnerHandle::new(Arc::default());
         let service = TrustService::new(Gate::Members(security), owner);
         let mut request =
             Request::new(v1::SetProjectRequest { project: "films".to_owned(), ..Default::default() });

@@ -398,11 +398,13 @@ fn farm_status() -> impl Strategy<Value = FarmStatus> {
         },
     );
     let parts = (vec(node, 0..4), vec(app, 0..4), vec(project, 0..4));
-    (any::<(u32, [u64; 5])>(), parts).prop_map(|((epoch, counts), (nodes, apps, projects))| FarmStatus {
-        projects,
+    let standbys = vec("[a-z0-9 ]{1,40}", 0..3);
+    (any::<(u32, [u64; 5])>(), parts, standbys).prop_map(|((epoch, counts), parts, standbys)| FarmStatus {
+        standbys,
+        projects: parts.2,
         epoch: Epoch(epoch),
-        nodes,
-        apps,
+        nodes: parts.0,
+        apps: parts.1,
         delivered_jobs: counts[0],
         replanned_jobs: counts[1],
         stolen_jobs: counts[2],

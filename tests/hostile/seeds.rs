@@ -457,6 +457,7 @@ fn status() -> FarmStatus {
         stolen_jobs: 1,
         speculations: 0,
         policy_fallbacks: 0,
+        standbys: vec!["process 7 of two".to_owned()],
     }
 }
 

@@ -17,6 +17,8 @@ pub(super) fn render(status: &FarmStatus) -> String {
 
     page.family("gleaner_epoch", "gauge", "Life of the coordinator.");
     page.sample("gleaner_epoch", &[], status.epoch.0);
+    page.family("gleaner_standbys", "gauge", "Coordinators that would take over.");
+    page.sample("gleaner_standbys", &[], status.standbys.len());
 
     page.family("gleaner_jobs_total", "counter", "Jobs by outcome since this start.");
     page.sample("gleaner_jobs_total", &[("outcome", &"delivered")], status.delivered_jobs);
@@ -242,6 +244,7 @@ mod tests {
         let text = render(&samples::farm());
         for line in [
             "gleaner_epoch 5",
+            "gleaner_standbys 1",
             "gleaner_jobs_total{outcome=\"delivered\"} 40",
             "gleaner_jobs_total{outcome=\"replanned\"} 6",
             "gleaner_jobs{state=\"waiting\"} 1",

@@ -155,6 +155,7 @@ pub(crate) mod samples {
             stolen_jobs: 7,
             speculations: 8,
             policy_fallbacks: 9,
+            standbys: vec!["process 7 of <two>".to_owned()],
         }
     }
 }

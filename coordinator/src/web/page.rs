@@ -31,13 +31,15 @@ fn write_body(page: &mut String, status: &FarmStatus) -> fmt::Result {
     let devices = status.nodes.iter().flat_map(|node| &node.devices).filter(|device| !device.lost).count();
     writeln!(
         page,
-        "<h1>Gleaner</h1><p>{} nodes, {devices} devices, {} applications; {} jobs delivered, {} stolen, {} replanned; {}.</p>",
+        "<h1>Gleaner</h1><p>{} nodes, {devices} devices, {} applications; {} jobs delivered, {} stolen, {} replanned; {}{}{}.</p>",
         status.nodes.len(),
         status.apps.len(),
         status.delivered_jobs,
         status.stolen_jobs,
         status.replanned_jobs,
-        status.epoch
+        status.epoch,
+        if status.standbys.is_empty() { "" } else { "; standing by: " },
+        Escaped(&status.standbys.join(", "))
     )?;
     write_nodes(page, status)?;
     write_apps(page, status)?;
@@ -158,7 +160,7 @@ mod tests {
             "a &lt;b&gt;&quot;GPU&quot;&lt;/b&gt; &amp; \\co",
             "1234.5",
             "2.500 s",
-            "epoch-5",
+            "epoch-5; standing by: process 7 of &lt;two&gt;.",
         ] {
             assert!(page.contains(part), "{part} is missing in\n{page}");
         }

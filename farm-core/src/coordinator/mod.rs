@@ -346,6 +346,8 @@ pub struct FarmStatus {
     pub speculations: u64,
     /// Batches placed first come, first served since this start because a plug-in failed.
     pub policy_fallbacks: u64,
+    /// Coordinators that would take over, in words. The driver knows them.
+    pub standbys: Vec<String>,
 }
 
 /// The coordinator.

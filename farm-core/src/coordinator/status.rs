@@ -17,6 +17,7 @@ impl CoordinatorMachine {
             stolen_jobs: self.stolen_jobs,
             speculations: self.speculations,
             policy_fallbacks: self.policy_fallbacks,
+            standbys: Vec::new(),
         }
     }
 

@@ -68,13 +68,17 @@ fn headline(status: &FarmStatus) -> String {
     };
     format!(
         "{word}  nodes: {nodes}  devices: {busy} of {} busy{}  jobs: {outstanding} placed, {waiting} waiting, {} delivered, \
-         {} stolen, {} replanned  (coordinator {})\n",
+         {} stolen, {} replanned  (coordinator {}{})\n",
         devices.len() - lost,
         if lost == 0 { String::new() } else { format!(", {lost} LOST") },
         status.delivered_jobs,
         status.stolen_jobs,
         status.replanned_jobs,
         status.epoch,
+        match &status.standbys[..] {
+            [] => String::new(),
+            standbys => format!(", standing by: {}", printable(&standbys.join(", "))),
+        },
     )
 }
 
@@ -204,6 +208,7 @@ mod tests {
             stolen_jobs: 0,
             speculations: 0,
             policy_fallbacks: 0,
+            standbys: Vec::new(),
         }
     }
 
@@ -224,6 +229,13 @@ mod tests {
         assert!(screen(&status, false).starts_with("WORKING"), "the next part of many");
         status.apps[0].outstanding_jobs = 0;
         assert!(screen(&status, false).starts_with("WAITING"));
+    }
+
+    #[test]
+    fn who_stands_by_is_named() {
+        let status = FarmStatus { standbys: vec!["process 7 of two".to_owned()], ..farm() };
+        let text = screen(&status, false);
+        assert!(text.contains("(coordinator epoch-2, standing by: process 7 of two)"), "{text}");
     }
 
     #[test]

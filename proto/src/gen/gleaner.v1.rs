@@ -454,6 +454,9 @@ pub struct FarmStatus {
     /// Projects by name.
     #[prost(message, repeated, tag = "9")]
     pub projects: ::prost::alloc::vec::Vec<ProjectStatus>,
+    /// Coordinators that would take over, in words.
+    #[prost(string, repeated, tag = "10")]
+    pub standbys: ::prost::alloc::vec::Vec<::prost::alloc::string::String>,
 }
 /// Asks what large contents the caches of nodes hold.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]

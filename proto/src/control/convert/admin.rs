@@ -29,6 +29,7 @@ impl From<FarmStatus> for v1::FarmStatus {
             speculations: status.speculations,
             policy_fallbacks: status.policy_fallbacks,
             projects: status.projects.into_iter().map(Into::into).collect(),
+            standbys: status.standbys,
         }
     }
 }
@@ -47,6 +48,7 @@ impl TryFrom<v1::FarmStatus> for FarmStatus {
             speculations: wire.speculations,
             policy_fallbacks: wire.policy_fallbacks,
             projects: list("FarmStatus.projects", MAX_ENTRIES, wire.projects)?,
+            standbys: addresses("FarmStatus.standbys", wire.standbys)?,
         })
     }
 }
