@@ -32,6 +32,7 @@ fn main() -> ExitCode {
         .with_writer(std::io::stderr)
         .log_internal_errors(false)
         .init();
+    proto::memory::give_large_blocks_back();
     let settings = match settings::settings(arguments) {
         Ok(settings) => settings,
         Err(error) => return failed(EXIT_USAGE, &error),

@@ -6,6 +6,7 @@
 pub mod codec;
 pub mod control;
 pub mod link;
+pub mod memory;
 pub mod net;
 pub mod tls;
 pub mod trust;

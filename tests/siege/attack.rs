@@ -19,6 +19,8 @@ use crate::{control, data};
 
 /// How long an attacker waits for an answer.
 pub(crate) const PATIENCE: Duration = Duration::from_secs(1);
+/// How long who has sent all that is taken goes on saying nothing.
+pub(crate) const STALL: Duration = Duration::from_secs(1);
 /// How long the first round of each attack may take.
 const FIRST_ROUND: Duration = Duration::from_secs(60);
 

@@ -17,7 +17,7 @@ use tokio::{
     time::{sleep, timeout},
 };
 
-use crate::attack::{PATIENCE, Tally, Target};
+use crate::attack::{PATIENCE, STALL, Tally, Target};
 
 /// Connections that speak slowly or not at all.
 pub(crate) const SLOW_CONNECTIONS: u64 = 300;
@@ -249,7 +249,7 @@ pub(crate) async fn requests(target: Target, tally: Tally) {
     }
 }
 
-/// Sessions whose first message has all bytes that a message may have but one.
+/// Sessions whose first message has all bytes that a message may have but one. They end, and come again.
 pub(crate) async fn fillers(target: Target, tally: Tally) {
     let length = u32::try_from(MAX_MESSAGE_BYTES).unwrap();
     let body = message(0, length, &vec![0; MAX_MESSAGE_BYTES - 1]);
@@ -262,9 +262,12 @@ pub(crate) async fn fillers(target: Target, tally: Tally) {
                 let peer = Peer::connect(target.grpc).await.ok()?;
                 let (answer, mut stream) = peer.request(SESSION, None).await.ok()?;
                 stream.send_data(body, false).ok()?;
-                let mut answer = answer.await.ok()?.into_body();
-                while let Some(Ok(_)) = answer.data().await {}
-                Some(())
+                let kept = async {
+                    let mut answer = answer.await.ok()?.into_body();
+                    while let Some(Ok(_)) = answer.data().await {}
+                    Some(())
+                };
+                timeout(STALL, kept).await.ok()?
             });
         }
         fillers.join_next().await;

@@ -36,7 +36,7 @@ use tokio::{
     time::{sleep, timeout},
 };
 
-use crate::attack::{PATIENCE, Tally, Target};
+use crate::attack::{PATIENCE, STALL, Tally, Target};
 
 /// Handshakes that begin and go no further, at a time.
 pub(crate) const HALF_HANDSHAKES: u64 = 512;
@@ -46,8 +46,6 @@ pub(crate) const STREAM_LINKS: u64 = 8;
 pub(crate) const ANNOUNCING_LINKS: u64 = 16;
 /// Links with as much of such frames as a link takes unread.
 pub(crate) const STALLED_LINKS: u64 = 2;
-/// How long a link of the latter stays, once it has sent that; then it comes again.
-const STALL: Duration = Duration::from_secs(1);
 /// Datagrams between two looks at what else there is to do.
 const BURST: u64 = 64;
 /// Between two rounds of half handshakes: less than a node's patience with one.
@@ -336,7 +334,7 @@ pub(crate) async fn announcements(target: Target, tally: Tally) {
     begin_frames(target, tally, ANNOUNCING_LINKS, 1, Duration::MAX).await;
 }
 
-/// The same, of which as much comes as a link takes unread. The links end, and come again.
+/// The same, of which as much comes as a link takes unread. They end, and come again.
 pub(crate) async fn stalled(target: Target, tally: Tally) {
     let share = (LINK_WINDOW_BYTES / BULK_STREAMS) as usize;
     begin_frames(target, tally, STALLED_LINKS, share, STALL).await;

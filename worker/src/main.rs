@@ -33,6 +33,7 @@ fn main() -> ExitCode {
     if let Some(code) = worker::serve_if_executor(std::env::args_os()) {
         return code;
     }
+    proto::memory::give_large_blocks_back();
     // clap exits with 2 by itself.
     let arguments = Arguments::parse();
     let options = match settings::options(arguments) {

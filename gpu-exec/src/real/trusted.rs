@@ -1,4 +1,4 @@
-//! The one place of unsafe code: compiling a module without runtime checks, and giving a driver back what it compiled.
+//! The one place of unsafe code of this crate: compiling a module without runtime checks, and giving a driver back what it compiled.
 //!
 //! It decides nothing: the operator's permission is [`crate::ExecutorConfig::unchecked`], the operator's folder is
 //! [`crate::ExecutorConfig::compiled`].
