@@ -107,6 +107,21 @@ fn seeds_that_are_missing_are_written_when_blessed() {
     }
 }
 
+/// What has no names for its fields is understood by those alone who have the same ones.
+#[test]
+fn what_is_said_and_kept_without_names_is_as_it_was() {
+    const NAMELESS: [&str; 5] =
+        ["frames_to_node", "frames_to_app", "job_program", "packed_programs", "saved_sums"];
+    for (target, name, make) in seeds::SEEDS.iter().filter(|(target, ..)| NAMELESS.contains(target)) {
+        let path = root().join("fuzz/corpus").join(target).join(name);
+        assert!(
+            fs::read(&path).unwrap_or_default() == make(),
+            "{} is encoded otherwise now: raise PROTOCOL_VERSION, or the file format's version, remove it and run this with FARM_BLESS=1",
+            path.display()
+        );
+    }
+}
+
 mod negative_control {
     //! Decoders that are wrong in each of the ways that are looked for. Each must be found.
 
