@@ -88,6 +88,7 @@ fn s07_a_standby_leads_when_the_leader_is_stopped() {
     let (status, stderr) = first.finish();
     assert_eq!(status.code(), Some(1), "{stderr}");
     assert!(stderr.contains("another coordinator has taken the farm over"), "{stderr}");
+    assert!(!stderr.contains('\x1b'), "a log that is no terminal has no colours: {stderr}");
     assert_eq!(standbys(), serde_json::json!([]), "it leads, and nobody stands by");
 
     // And back: the other one stands by again, and the leader's process is killed.
