@@ -1,10 +1,15 @@
 //! `farmctl` as scripts and people meet it: exit codes, error texts that name the place, JSON.
 
-use std::{fs, net::TcpListener};
+use std::{
+    fs,
+    io::{BufRead as _, BufReader},
+    net::TcpListener,
+    process::{Command, Stdio},
+};
 
 use serde_json::Value;
 use tempfile::TempDir;
-use tests::{Farm, Process, farmctl};
+use tests::{Farm, Process, binary, farmctl};
 
 fn text(bytes: &[u8]) -> String {
     String::from_utf8_lossy(bytes).into_owned()
@@ -25,6 +30,24 @@ fn status_shows_nodes_and_devices_as_json() {
     let status: Value = serde_json::from_slice(&output.stdout).expect("JSON on stdout");
     assert_eq!(status["nodes"][0]["name"], "w0", "{status}");
     assert_eq!(status["nodes"][0]["devices"][0]["score"], 1000.0, "{status}");
+}
+
+/// `farmctl status --watch | head -1`: once nobody reads, it ends.
+#[test]
+fn a_watch_ends_when_its_reader_does() {
+    let farm = Farm::coordinator();
+    let mut watch = Command::new(binary("farmctl"))
+        .args(["--coordinator", &farm.grpc, "status", "--watch", "100ms"])
+        .stdout(Stdio::piped())
+        .spawn()
+        .expect("farmctl starts");
+    let mut line = String::new();
+    let mut reader = BufReader::new(watch.stdout.take().expect("it is piped"));
+    reader.read_line(&mut line).expect("a line comes");
+    assert!(line.starts_with("EMPTY"), "no codes for a screen that is none: {line:?}");
+    drop(reader);
+    // The runner ends a test that hangs.
+    assert!(watch.wait().expect("it ends").success());
 }
 
 #[test]

@@ -2,7 +2,13 @@
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on panics")]
 
-use std::{fs, net::TcpListener, path::Path, time::Instant};
+use std::{
+    fs,
+    net::TcpListener,
+    path::Path,
+    thread,
+    time::{Duration, Instant},
+};
 
 use tests::{Process, Signal, farmctl};
 
@@ -64,9 +70,15 @@ fn s07_a_standby_leads_when_the_leader_is_stopped() {
         let status = farmctl(["--coordinator", &coordinators, "-o", "json", "status"]);
         serde_json::from_slice::<serde_json::Value>(&status.stdout).unwrap()["standbys"].clone()
     };
-    // It was shown a few heartbeats after it came; the render took longer.
-    let standing_by = standbys();
-    assert!(standing_by[0].as_str().is_some_and(|who| who.starts_with("process ")), "{standing_by}");
+    let seen = |who: &serde_json::Value| who[0].as_str().is_some_and(|who| who.starts_with("process "));
+    let came = Instant::now();
+    while !seen(&standbys()) {
+        assert!(
+            came.elapsed() < Duration::from_secs(30),
+            "the one that stands by is shown after two heartbeats"
+        );
+        thread::sleep(Duration::from_millis(100));
+    }
     let running_image = folder.path().join("running.exr");
     let mut running = render(&coordinators, &scene, &running_image);
     running.wait_for(|line| line["jobs_done"].as_u64().is_some_and(|done| done >= 2));

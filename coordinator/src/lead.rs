@@ -14,7 +14,7 @@ use std::{
     path::{Path, PathBuf},
     process,
     sync::{
-        Arc, Mutex, OnceLock, PoisonError, Weak,
+        Arc, LazyLock, Mutex, OnceLock, PoisonError, Weak,
         atomic::{AtomicBool, Ordering},
     },
     thread,
@@ -35,8 +35,10 @@ const MAX_CONTENT_BYTES: u64 = 512;
 /// How often a standby looks at the leader's beat.
 const LOOK: Duration = Duration::from_millis(200);
 /// This boot of this system, containers included: file locks reach as far.
-const BOOT_FILE: &str = "/proc/sys/kernel/random/boot_id";
-const HOST_FILE: &str = "/proc/sys/kernel/hostname";
+static BOOT: LazyLock<String> = LazyLock::new(|| line_of("/proc/sys/kernel/random/boot_id"));
+/// This process, for people. One text for as long as it lives.
+static HOLDER: LazyLock<String> =
+    LazyLock::new(|| format!("process {} of {}", process::id(), line_of("/proc/sys/kernel/hostname")));
 
 /// What a standby found: the last term, and nobody who leads by it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -107,6 +109,11 @@ impl Lead {
         }
         let beating = Arc::downgrade(&lead);
         thread::Builder::new().name("lead".to_owned()).spawn(move || beat(&beating)).map_err(fault)?;
+        let looking = Arc::downgrade(&lead);
+        thread::Builder::new()
+            .name("standbys".to_owned())
+            .spawn(move || look_for_standbys(&looking))
+            .map_err(fault)?;
         Ok(lead)
     }
 
@@ -211,7 +218,19 @@ fn beat(lead: &Weak<Lead>) {
             }
             Err(_) => {}
         }
-        lead.standbys.look(&lead.directory);
+    }
+}
+
+/// A file that does not answer, on a disk of the network, holds no beat up.
+fn look_for_standbys(lead: &Weak<Lead>) {
+    loop {
+        let Some((standbys, directory, liveness)) =
+            lead.upgrade().map(|lead| (lead.standbys(), lead.directory.clone(), lead.liveness))
+        else {
+            return;
+        };
+        standbys.look(&directory, Duration::from_millis(liveness.dead_ms));
+        thread::sleep(Duration::from_millis(liveness.heartbeat_ms));
     }
 }
 
@@ -262,7 +281,7 @@ impl Watch {
         if term == 0 {
             return Ok(Look::Free(Vacancy { term, silent: false }));
         }
-        self.presence.show()?;
+        self.presence.show();
         let file = match File::open(TERMS.path(&self.directory, term)) {
             Ok(file) => file,
             // A successor has tidied up.
@@ -285,8 +304,7 @@ impl Watch {
         self.seen = Some(seen);
         let dead_ms = content.as_ref().map_or(0, |content| content.dead_ms).max(self.own_dead_ms);
         // Of another system a lock says nothing that can be relied on.
-        let here =
-            content.is_some_and(|content| !content.boot.is_empty() && content.boot == line_of(BOOT_FILE));
+        let here = content.is_some_and(|content| !content.boot.is_empty() && content.boot == *BOOT);
         if here && file.try_lock_shared().is_ok() {
             return Ok(Look::Free(Vacancy { term, silent: false }));
         }
@@ -317,7 +335,7 @@ struct Content {
 impl Content {
     /// This process's.
     fn new(beat: u64, liveness: Liveness) -> Self {
-        Self { beat, dead_ms: liveness.dead_ms, boot: line_of(BOOT_FILE), holder: holder() }
+        Self { beat, dead_ms: liveness.dead_ms, boot: BOOT.clone(), holder: HOLDER.clone() }
     }
 
     fn to_text(&self) -> String {
@@ -331,10 +349,6 @@ impl Content {
         let dead_ms = words.next()?.parse().ok()?;
         Some(Self { beat, dead_ms, boot: words.next()?.to_owned(), holder: words.next()?.to_owned() })
     }
-}
-
-fn holder() -> String {
-    format!("process {} of {}", process::id(), line_of(HOST_FILE))
 }
 
 fn line_of(file: &str) -> String {

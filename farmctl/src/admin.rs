@@ -84,7 +84,7 @@ impl Admin {
     /// Makes a join token; gives its number, too.
     pub(crate) async fn create_token(&self, invitation: &Invitation) -> Result<(u64, JoinToken), Failure> {
         let (address, identity) = self.to();
-        control::create_token(address, identity, invitation).await.map_err(usage)
+        control::create_token(address, identity, invitation).await.map_err(failure)
     }
 
     /// The tokens that can still be used.
@@ -108,7 +108,7 @@ impl Admin {
     /// Makes a project, or changes what it may have; gives what it may have now.
     pub(crate) async fn set_project(&self, project: &str, change: QuotaChange) -> Result<Quota, Failure> {
         let (address, identity) = self.to();
-        control::set_project(address, identity, project, change).await.map_err(usage)
+        control::set_project(address, identity, project, change).await.map_err(failure)
     }
 
     /// Removes a project that nobody belongs to.
@@ -120,22 +120,15 @@ impl Admin {
     /// Ends a membership.
     pub(crate) async fn expel(&self, uri: &str) -> Result<(), Failure> {
         let (address, identity) = self.to();
-        control::expel(address, identity, uri).await.map_err(usage)
-    }
-}
-
-/// A request that is refused for what it says is a wrong usage.
-pub(crate) fn usage(error: SessionError) -> Failure {
-    match error {
-        SessionError::Refused { .. } => Failure::Usage(error.into()),
-        error => failure(error),
+        control::expel(address, identity, uri).await.map_err(failure)
     }
 }
 
 /// What a failed request is to the one who asked.
 pub(crate) fn failure(error: SessionError) -> Failure {
     match error {
-        SessionError::Address { .. } => Failure::Usage(error.into()),
+        // There is no such thing, or what there is stands against it.
+        SessionError::Address { .. } | SessionError::Refused { .. } => Failure::Usage(error.into()),
         SessionError::Unreachable { ref address, .. } => {
             let hint = if address.contains(',') {
                 "none of the coordinators answers; if one just ended, its standby leads within some 10 s: try again then"
@@ -147,7 +140,6 @@ pub(crate) fn failure(error: SessionError) -> Failure {
         SessionError::Denied { .. } => Failure::Denied(error.into()),
         SessionError::Ended { .. }
         | SessionError::Malformed { .. }
-        | SessionError::Refused { .. }
         | SessionError::Failed { .. }
         | SessionError::UnknownRequest
         | SessionError::Full => Failure::Work(error.into()),

@@ -11,23 +11,37 @@ pub(crate) fn print<T: Serialize>(
     format: Format,
     table: impl Fn(&T, bool) -> String,
 ) -> Result<(), Failure> {
-    let text = match format {
+    print_text(&text_of(data, format, table)?)
+}
+
+/// What [`print`] prints.
+pub(crate) fn text_of<T: Serialize>(
+    data: &T,
+    format: Format,
+    table: impl Fn(&T, bool) -> String,
+) -> Result<String, Failure> {
+    Ok(match format {
         Format::Json => serde_json::to_string_pretty(data)? + "\n",
         Format::Ndjson => serde_json::to_string(data)? + "\n",
         Format::Table => table(data, false),
         Format::Wide => table(data, true),
-    };
-    print_text(&text)
+    })
 }
 
 /// Writes to stdout; a reader that went away (`| head`) is no failure.
 pub(crate) fn print_text(text: &str) -> Result<(), Failure> {
+    was_read(text).map(drop)
+}
+
+/// Writes to stdout; whether somebody reads it.
+pub(crate) fn was_read(text: &str) -> Result<bool, Failure> {
     use std::io::Write as _;
 
     let mut stdout = std::io::stdout().lock();
     match stdout.write_all(text.as_bytes()).and_then(|()| stdout.flush()) {
-        Err(error) if error.kind() != std::io::ErrorKind::BrokenPipe => Err(error.into()),
-        _ => Ok(()),
+        Ok(()) => Ok(true),
+        Err(error) if error.kind() == std::io::ErrorKind::BrokenPipe => Ok(false),
+        Err(error) => Err(error.into()),
     }
 }
 

@@ -11,7 +11,7 @@ pub enum OpenError {
     /// The machine has no Vulkan implementation at all.
     #[error(
         "no Vulkan adapter found for `--device {spec}`: install a GPU driver, or on Debian the software one with \
-         `apt-get install mesa-vulkan-drivers libvulkan1`; `--device sim` works without any"
+         `apt-get install mesa-vulkan-drivers libvulkan1`"
     )]
     NoAdapter {
         /// What was asked for.

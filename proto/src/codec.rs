@@ -70,6 +70,11 @@ pub fn decode_program(bytes: &[u8]) -> Result<JobProgram, CodecError> {
     decode("job program", bytes, MAX_PROGRAM_BYTES)
 }
 
+/// Most bytes of the payload of a frame of one program.
+pub const MAX_PACKED_BYTES: u64 = (PACKED_LENGTH_BYTES + MAX_PROGRAM_BYTES) as u64;
+/// Of the length before each program.
+const PACKED_LENGTH_BYTES: usize = size_of::<u32>();
+
 /// The payload of a `Jobs` frame: the encoded programs in the order of the tickets, each behind its length (`u32`,
 /// little-endian). Small ones are copied side by side, large ones are passed on as they are.
 #[must_use]
@@ -99,19 +104,19 @@ pub fn pack_programs<'a>(programs: impl IntoIterator<Item = &'a Bytes>) -> Vec<B
 pub fn unpack_programs(mut payload: Bytes, count: usize) -> Result<Vec<Bytes>, CodecError> {
     const WHAT: &str = "payload of programs";
     // Each program takes at least its length field: the count is bounded by the bytes before anything is allocated.
-    if count > payload.len() / 4 {
+    if count > payload.len() / PACKED_LENGTH_BYTES {
         return Err(malformed(WHAT, format!("{} B cannot hold {count} programs", payload.len())));
     }
     let mut programs = Vec::with_capacity(count);
     for index in 0..count {
-        let Some((length, _)) = payload.split_first_chunk::<4>() else {
+        let Some((length, _)) = payload.split_first_chunk::<PACKED_LENGTH_BYTES>() else {
             return Err(malformed(WHAT, format!("ends before program {index} of {count}")));
         };
         let length = u32::from_le_bytes(*length) as usize;
         if length > MAX_PROGRAM_BYTES {
             return Err(too_large("job program", length, MAX_PROGRAM_BYTES));
         }
-        let _ = payload.split_to(4);
+        let _ = payload.split_to(PACKED_LENGTH_BYTES);
         if length > payload.len() {
             return Err(malformed(WHAT, format!("ends inside program {index} of {count}")));
         }

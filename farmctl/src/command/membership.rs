@@ -88,9 +88,9 @@ async fn join_as(address: &str, token: &JoinToken, name: Option<&str>) -> Result
         (Err(control::SessionError::Denied { reason }), None) if reason.contains("choose one") => {
             let host = host_name()
                 .ok_or_else(|| Failure::Usage(anyhow!("this host has no usable name: say --name")))?;
-            control::join(address, token, Some(&host)).await.map_err(admin::usage)
+            control::join(address, token, Some(&host)).await.map_err(admin::failure)
         }
-        (joined, _) => joined.map_err(admin::usage),
+        (joined, _) => joined.map_err(admin::failure),
     }
 }
 

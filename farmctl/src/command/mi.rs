@@ -180,7 +180,9 @@ fn read(arguments: &MiArgs) -> Result<Input, Failure> {
     let earlier = match (fs::read(&path), arguments.extend) {
         // Written by the run that the journal is of, which ended before it could remove it: the same sums will follow.
         (Ok(sums), false) if arguments.resume && journal_path(arguments).exists() => {
-            let there = saved::load(&alignment, Seed(arguments.seed), &sums).with_context(|| shown(&path))?;
+            let there = saved::load(&alignment, Seed(arguments.seed), &sums)
+                .with_context(|| shown(&path))
+                .map_err(Failure::Usage)?;
             if there.iterations() as u64 > arguments.iterations {
                 let reason = anyhow!(
                     "{} has {} iterations: another run's, which is not written over",
@@ -332,8 +334,12 @@ fn tell(summary: &RunSummary, arguments: &MiArgs, added: u64, best: &str) -> Res
         print_text(&format!("{line}\n"))?;
     }
     tell!(
-        "farmctl: {} written: {added} iterations in {} jobs{}, {seconds:.1} s{}; {best}",
+        "farmctl: {} written: {} in {} jobs{}, {seconds:.1} s{}; {best}",
         shown(&arguments.folder),
+        match arguments.iterations {
+            all if all == added => format!("{all} iterations"),
+            all => format!("{all} iterations, {added} of them new,"),
+        },
         summary.jobs,
         taken_over(summary.journalled),
         moved(summary.replanned),

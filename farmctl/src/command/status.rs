@@ -1,6 +1,6 @@
 //! `farmctl status`: the farm on one screen.
 
-use std::{collections::BTreeMap, time::Duration};
+use std::{collections::BTreeMap, io::IsTerminal as _, time::Duration};
 
 use farm_core::coordinator::{AppStatus, DeviceStatus, FarmStatus, NodeState, NodeStatus};
 
@@ -16,14 +16,15 @@ use crate::{
 pub(crate) async fn run(arguments: &StatusArgs, target: &Target<'_>, format: Format) -> Result<(), Failure> {
     let admin = Admin::new(target.existing().await?);
     let format = arguments.output.unwrap_or(format);
+    let on_screen = matches!(format, Format::Table | Format::Wide) && std::io::stdout().is_terminal();
     loop {
-        let status = admin.status().await?;
-        if arguments.watch.is_some() && matches!(format, Format::Table | Format::Wide) {
+        let mut text = output::text_of(&admin.status().await?, format, screen)?;
+        if arguments.watch.is_some() && on_screen {
             // Home and clear to the end: the screen does not flicker and keeps its scrollback.
-            output::print_text("\x1b[H\x1b[J")?;
+            text.insert_str(0, "\x1b[H\x1b[J");
         }
-        output::print(&status, format, screen)?;
-        let Some(interval) = arguments.watch else { return Ok(()) };
+        let read = output::was_read(&text)?;
+        let Some(interval) = arguments.watch.filter(|_| read) else { return Ok(()) };
         tokio::time::sleep(interval.max(Duration::from_millis(100))).await;
     }
 }
@@ -60,11 +61,11 @@ fn headline(status: &FarmStatus) -> String {
     let outstanding: u64 = status.apps.iter().map(|app| app.outstanding_jobs).sum();
     // Jobs that wait while others of their application have a place are nothing to look after: they are placed in parts.
     let stuck = status.apps.iter().any(|app| app.waiting_jobs > 0 && app.outstanding_jobs == 0);
-    let word = match (stuck, outstanding, status.nodes.is_empty()) {
-        (_, _, true) => "EMPTY",
-        (true, _, _) => "WAITING",
-        (false, 1.., _) => "WORKING",
-        (false, 0, _) => "IDLE",
+    let word = match (status.nodes.is_empty(), stuck, outstanding > 0 || busy > 0) {
+        (true, _, _) => "EMPTY",
+        (false, true, _) => "WAITING",
+        (false, false, true) => "WORKING",
+        (false, false, false) => "IDLE",
     };
     format!(
         "{word}  nodes: {nodes}  devices: {busy} of {} busy{}  jobs: {outstanding} placed, {waiting} waiting, {} delivered, \

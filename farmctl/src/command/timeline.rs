@@ -65,11 +65,18 @@ fn choose(name: &str, head: &TimelineHead) -> Result<(Option<AppId>, Option<Task
         Some((app, task)) => (app, Some(task)),
         None => (name, None),
     };
-    let named = |candidate: &&TimelineApp| {
-        let id = candidate.app.to_string();
-        id == app || id.strip_prefix("app-") == Some(app)
+    let app = app.strip_prefix("app-").unwrap_or(app);
+    let of_this_name = |short: bool| {
+        let name = move |candidate: &&TimelineApp| {
+            let id = candidate.app.to_string();
+            let id = id.strip_prefix("app-").unwrap_or(&id);
+            // Without the coordinator's life before it.
+            let id = if short { id.rsplit_once('.').map_or(id, |(_, number)| number) } else { id };
+            id == app
+        };
+        head.apps.iter().rev().find(name)
     };
-    let found = head.apps.iter().find(named).ok_or_else(unknown)?;
+    let found = of_this_name(false).or_else(|| of_this_name(true)).ok_or_else(unknown)?;
     let Some(task) = task else { return Ok((Some(found.app), None)) };
     let task = task.strip_prefix("task-").unwrap_or(task);
     let ran = found.tasks.iter().map(|(task, _)| *task).find(|ran| ran.0.to_string() == task);
@@ -100,14 +107,20 @@ mod tests {
             name: "render".to_owned(),
             tasks: vec![(TaskId(0), 5), (TaskId(2), 1)],
         };
-        TimelineHead { apps: vec![app(1), app(3)], ..TimelineHead::default() }
+        TimelineHead {
+            apps: vec![app(1), app(3), app(6 << 32 | 3), app(8 << 32 | 4)],
+            ..TimelineHead::default()
+        }
     }
 
     #[test]
     fn names_mean_applications_and_tasks() {
-        let third = Some(AppId(3));
+        let (third, last) = (Some(AppId(3)), Some(AppId(8 << 32 | 4)));
         for (name, meant) in [
-            ("@last", (third, None)),
+            ("@last", (last, None)),
+            ("app-9.4", (last, None)),
+            ("4/2", (last, Some(TaskId(2)))),
+            ("7.3", (Some(AppId(6 << 32 | 3)), None)),
             ("@all", (None, None)),
             ("3", (third, None)),
             ("app-3", (third, None)),
@@ -120,7 +133,7 @@ mod tests {
 
     #[test]
     fn an_unknown_name_is_answered_with_what_there_is() {
-        for name in ["2", "app-2", "3/1", "3/", "", "task-0", "app-app-3"] {
+        for name in ["2", "app-2", "3/1", "3/", "", "task-0", "app-app-3", "5.4"] {
             let text = choose(name, &head()).unwrap_err().describe();
             assert!(text.contains("app-1 (render, 2 tasks)") && text.contains("app-3"), "{name:?}: {text}");
         }

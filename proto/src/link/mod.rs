@@ -46,7 +46,7 @@ pub use self::{
     send::{LinkSender, TrySendError},
     wire::{decode_frames, encode_frame},
 };
-use crate::codec::{CodecError, MAX_PROGRAM_BYTES};
+use crate::codec::{CodecError, MAX_PACKED_BYTES};
 
 /// Frames with at most this much payload share the ordered stream, in bytes.
 pub const SMALL_PAYLOAD_BYTES: usize = 64 << 10;
@@ -67,7 +67,7 @@ pub trait Header: Serialize + DeserializeOwned + fmt::Debug + Send + Sync + 'sta
 
 impl Header for AppToNode {
     /// One program; several go in smaller frames.
-    const MAX_PAYLOAD_BYTES: u64 = MAX_PROGRAM_BYTES as u64;
+    const MAX_PAYLOAD_BYTES: u64 = MAX_PACKED_BYTES;
 }
 
 impl Header for NodeToApp {

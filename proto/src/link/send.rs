@@ -278,7 +278,19 @@ async fn write_bulk<S: Header>(
 
 #[cfg(test)]
 mod tests {
+    use farm_core::message::AppToNode;
+
     use super::*;
+    use crate::codec::{MAX_PROGRAM_BYTES, pack_programs};
+
+    /// Zeros, of which the system makes memory when they are read.
+    #[test]
+    fn a_program_of_any_size_goes_in_a_frame() {
+        let largest = pack_programs([&Bytes::from(vec![0; MAX_PROGRAM_BYTES])]);
+        assert!(payload_bytes::<AppToNode>(&largest).unwrap() > MAX_PROGRAM_BYTES);
+        let larger = [largest, vec![Bytes::from_static(b".")]].concat();
+        payload_bytes::<AppToNode>(&larger).unwrap_err();
+    }
 
     #[test]
     fn small_frames_pass_large_ones_and_all_pass_contents() {
