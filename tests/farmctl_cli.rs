@@ -32,6 +32,31 @@ fn status_shows_nodes_and_devices_as_json() {
     assert_eq!(status["nodes"][0]["devices"][0]["score"], 1000.0, "{status}");
 }
 
+#[test]
+fn a_farm_whose_own_worker_was_drained_says_so_and_ends_in_order() {
+    let mut up = Command::new(binary("farmctl"))
+        .args(["up", "--listen", "127.0.0.1:0", "--http", "127.0.0.1:0"])
+        .args(["--device", "sim:score=1000,speed=1.0"])
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()
+        .expect("farmctl starts");
+    let mut ready = String::new();
+    BufReader::new(up.stdout.take().expect("it is piped")).read_line(&mut ready).expect("a line comes");
+    let ready: Value = serde_json::from_str(&ready).expect("JSON");
+    let grpc = ready["grpc"].as_str().expect("an address");
+    let status = farmctl(["--coordinator", grpc, "-o", "json", "status"]);
+    let status: Value = serde_json::from_slice(&status.stdout).expect("JSON on stdout");
+    let node = status["nodes"][0]["node"].to_string();
+    assert!(farmctl(["--coordinator", grpc, "node", "drain", &node]).status.success());
+    // The runner ends a test that hangs.
+    let mut told = BufReader::new(up.stderr.take().expect("it is piped")).lines().map_while(Result::ok);
+    assert!(told.any(|line| line.contains("has left (it was drained)")));
+    let asked = Command::new("kill").arg(up.id().to_string()).status();
+    assert!(asked.expect("procps is there").success());
+    assert!(up.wait().expect("it ends").success());
+}
+
 /// `farmctl status --watch | head -1`: once nobody reads, it ends.
 #[test]
 fn a_watch_ends_when_its_reader_does() {

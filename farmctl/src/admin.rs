@@ -16,7 +16,11 @@ use proto::{
     trust::{Identity, JoinToken},
 };
 
-use crate::{failure::Failure, output::printable, target::Reach};
+use crate::{
+    failure::Failure,
+    output::printable,
+    target::{DEFAULT_COORDINATOR, Reach},
+};
 
 /// The coordinator that operator verbs talk to.
 #[derive(Debug)]
@@ -132,8 +136,10 @@ pub(crate) fn failure(error: SessionError) -> Failure {
         SessionError::Unreachable { ref address, .. } => {
             let hint = if address.contains(',') {
                 "none of the coordinators answers; if one just ended, its standby leads within some 10 s: try again then"
-            } else {
+            } else if address == DEFAULT_COORDINATOR {
                 "no farm answers; start one with `farmctl up`, or name it with --coordinator or GLEANER_COORDINATOR"
+            } else {
+                "no farm answers there; is its coordinator up, and is that its address?"
             };
             Failure::Unreachable(anyhow::Error::new(error).context(hint))
         }

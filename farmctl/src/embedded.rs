@@ -4,7 +4,7 @@
 use anyhow::Context as _;
 use coordinator::{CoordinatorHandle, CoordinatorOptions};
 use gpu_exec::DeviceSpec;
-use worker::{Isolation, WorkerHandle, WorkerOptions};
+use worker::{End, Isolation, WorkerHandle, WorkerOptions};
 
 use crate::{
     failure::Failure,
@@ -72,6 +72,14 @@ impl EmbeddedFarm {
     /// The worker.
     pub(crate) const fn worker(&self) -> &WorkerHandle {
         &self.worker
+    }
+
+    /// Waits until the worker is none any more; gives why. Cancel-safe.
+    pub(crate) async fn worker_left(&mut self) -> String {
+        match self.worker.ended().await {
+            End::Drained => "it was drained".to_owned(),
+            End::Denied { reason } | End::Refused { reason } | End::Failed { reason } => reason,
+        }
     }
 
     /// Drains the worker, then stops the coordinator.

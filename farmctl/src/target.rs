@@ -14,7 +14,7 @@ use proto::{
 use crate::failure::Failure;
 
 /// Where `farmctl up` and `farm-coordinator` listen unless told otherwise.
-const DEFAULT_COORDINATOR: &str = "127.0.0.1:7700";
+pub(crate) const DEFAULT_COORDINATOR: &str = "127.0.0.1:7700";
 
 /// As the command line says it.
 #[derive(Debug)]

@@ -197,6 +197,7 @@ pub struct WorkerHandle {
     info: WorkerInfo,
     inputs: mpsc::Sender<Input>,
     driver: JoinHandle<End>,
+    end: Option<End>,
 }
 
 impl WorkerHandle {
@@ -214,10 +215,12 @@ impl WorkerHandle {
 
     /// Waits until it ends by itself. Cancel-safe.
     pub async fn ended(&mut self) -> End {
-        match (&mut self.driver).await {
-            Ok(end) => end,
-            Err(error) => End::Failed { reason: format!("the worker's task ended: {error}") },
+        if let Some(end) = &self.end {
+            return end.clone();
         }
+        let ended = (&mut self.driver).await;
+        let failed = |error| End::Failed { reason: format!("the worker's task ended: {error}") };
+        self.end.insert(ended.unwrap_or_else(failed)).clone()
     }
 
     /// Takes no new work, finishes what runs, delivers it (for a bounded time), says goodbye and ends.
@@ -309,7 +312,7 @@ pub async fn start(options: WorkerOptions) -> Result<WorkerHandle, StartError> {
         }
     };
     let info = WorkerInfo { name: options.name, node, data, contact, devices: infos };
-    Ok(WorkerHandle { info, inputs, driver })
+    Ok(WorkerHandle { info, inputs, driver, end: None })
 }
 
 /// Opens the caches; a large folder takes its time.

@@ -248,7 +248,7 @@ fn name(given: Option<String>, identity: Option<&Identity>) -> anyhow::Result<St
         return Ok(format!("{host}-{}", std::process::id()));
     };
     let fits = !name.is_empty() && name.len() <= MAX_NAME_BYTES && !name.contains(char::is_control);
-    ensure!(fits, "name {name:?}: 1 to {MAX_NAME_BYTES} B without control characters may be");
+    ensure!(fits, "name {name:?}: a name has 1 to {MAX_NAME_BYTES} B and no control characters");
     Ok(name)
 }
 

@@ -137,10 +137,11 @@ impl Standbys {
                 continue;
             }
             let content = Content::parse(&text);
+            let lives = before.is_some() && content.is_some();
             let (dead_ms, holder) =
                 content.map(|content| (content.dead_ms, content.holder)).unwrap_or_default();
             let now = Seen {
-                lives: before.is_some(),
+                lives,
                 text,
                 since: Instant::now(),
                 silence: Duration::from_millis(dead_ms).max(patience),

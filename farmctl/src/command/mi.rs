@@ -386,8 +386,12 @@ impl Results {
         })?;
         let text = serde_json::to_string_pretty(record)? + "\n";
         place(&self.folder, "run.json", |out| out.write_all(text.as_bytes()))?;
-        let best = pairs.iter().max_by(|a, b| a.z.total_cmp(&b.z).then(a.mi_bits.total_cmp(&b.mi_bits)));
-        Ok(best.map_or_else(String::new, |best| {
+        let best = pairs
+            .iter()
+            .filter(|pair| !pair.z_undefined)
+            .max_by(|a, b| a.z.total_cmp(&b.z).then(a.mi_bits.total_cmp(&b.mi_bits)));
+        let none = || "no pair has a Z: nothing varies".to_owned();
+        Ok(best.map_or_else(none, |best| {
             let number = |column| self.alignment.number(column);
             format!("highest Z {:.1}: columns {} and {}", best.z, number(best.i), number(best.j))
         }))

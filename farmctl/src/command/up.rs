@@ -4,7 +4,7 @@ use std::net::{SocketAddr, ToSocketAddrs as _};
 
 use coordinator::CoordinatorOptions;
 use serde_json::json;
-use tokio::signal::unix::{SignalKind, signal};
+use tokio::signal::unix::{Signal, SignalKind, signal};
 
 use crate::{cli::UpArgs, embedded::EmbeddedFarm, failure::Failure, output};
 
@@ -16,7 +16,7 @@ pub(crate) async fn run(arguments: &UpArgs) -> Result<(), Failure> {
         http: resolve("--http", &arguments.http)?,
         ..CoordinatorOptions::embedded()
     };
-    let farm = EmbeddedFarm::start_with(options, &arguments.devices).await?;
+    let mut farm = EmbeddedFarm::start_with(options, &arguments.devices).await?;
 
     let devices = &farm.worker().info().devices;
     let ready = json!({
@@ -31,14 +31,25 @@ pub(crate) async fn run(arguments: &UpArgs) -> Result<(), Failure> {
     tell!("farmctl: the farm is up; status page http://{}; Ctrl-C ends it", farm.coordinator().http_addr());
 
     tokio::select! {
-        _ = interrupt.recv() => {}
-        _ = terminate.recv() => {}
+        () = asked_to_end(&mut interrupt, &mut terminate) => {}
+        why = farm.worker_left() => {
+            tell!("farmctl: the worker of this process has left ({why}); others may join the farm; Ctrl-C ends it");
+            asked_to_end(&mut interrupt, &mut terminate).await;
+        }
     }
     tell!("farmctl: draining; again to end at once");
     tokio::select! {
         () = farm.stop() => Ok(()),
-        _ = interrupt.recv() => Err(Failure::Work(anyhow::anyhow!("ended before the farm was drained"))),
-        _ = terminate.recv() => Err(Failure::Work(anyhow::anyhow!("ended before the farm was drained"))),
+        () = asked_to_end(&mut interrupt, &mut terminate) => {
+            Err(Failure::Work(anyhow::anyhow!("ended before the farm was drained")))
+        }
+    }
+}
+
+async fn asked_to_end(interrupt: &mut Signal, terminate: &mut Signal) {
+    tokio::select! {
+        _ = interrupt.recv() => {}
+        _ = terminate.recv() => {}
     }
 }
 
