@@ -47,8 +47,8 @@ fn a_farm_whose_own_worker_was_drained_says_so_and_ends_in_order() {
     let grpc = ready["grpc"].as_str().expect("an address");
     let status = farmctl(["--coordinator", grpc, "-o", "json", "status"]);
     let status: Value = serde_json::from_slice(&status.stdout).expect("JSON on stdout");
-    let node = status["nodes"][0]["node"].to_string();
-    assert!(farmctl(["--coordinator", grpc, "node", "drain", &node]).status.success());
+    let node = status["nodes"][0]["node"].as_str().expect("as the table shows it");
+    assert!(farmctl(["--coordinator", grpc, "node", "drain", node]).status.success());
     // The runner ends a test that hangs.
     let mut told = BufReader::new(up.stderr.take().expect("it is piped")).lines().map_while(Result::ok);
     assert!(told.any(|line| line.contains("has left (it was drained)")));

@@ -4,6 +4,7 @@
 use std::{collections::BTreeMap, fs, path::Path};
 
 use client_sdk::Journal;
+use farm_core::id::AppId;
 use serde_json::Value;
 use tempfile::TempDir;
 use tests::{Farm, Process, Signal, farmctl};
@@ -114,12 +115,13 @@ struct Ran {
 fn completed_by_the_last_two(farm: &Farm) -> (Vec<Ran>, Vec<Ran>) {
     let output = farmctl(["--coordinator", &farm.grpc, "timeline", "@all", "-o", "json"]);
     let timeline: Value = serde_json::from_slice(&output.stdout).expect("the timeline is JSON");
-    let mut of_apps: BTreeMap<u64, Vec<Ran>> = BTreeMap::new();
+    let mut of_apps: BTreeMap<AppId, Vec<Ran>> = BTreeMap::new();
     for segment in timeline["segments"].as_array().expect("segments") {
         let number = |value: &Value| value.as_u64().unwrap_or_else(|| panic!("a number in {segment}"));
         let ran = Ran { started_at: number(&segment["started_at"]), ended_at: number(&segment["ended_at"]) };
         if segment["outcome"] == "completed" {
-            of_apps.entry(number(&segment["job"]["job"]["app"])).or_default().push(ran);
+            let app = segment["job"]["job"]["app"].as_str().expect("an id").parse().expect("as it is shown");
+            of_apps.entry(app).or_default().push(ran);
         }
     }
     let (_, last) = of_apps.pop_last().expect("the last application");

@@ -238,10 +238,11 @@ fn a_project_has_what_its_quota_says() {
     let timeline = farm.as_who("artist", &["timeline", "-o", "json"]);
     let timeline: serde_json::Value = serde_json::from_slice(&timeline.stdout).unwrap();
     let segments = timeline["segments"].as_array().unwrap();
-    let mut spans: Vec<(u64, u64, u64)> = segments
+    let mut spans: Vec<(u64, u64, &str)> = segments
         .iter()
         .map(|segment| {
-            ["scheduled_at", "ended_at", "node"].map(|field| segment[field].as_u64().unwrap()).into()
+            let [from, to] = ["scheduled_at", "ended_at"].map(|field| segment[field].as_u64().unwrap());
+            (from, to, segment["node"].as_str().unwrap())
         })
         .collect();
     spans.sort_unstable();

@@ -1,9 +1,21 @@
 //! Identities that cross process boundaries. Each is a newtype with `Display`; a raw integer never crosses a
 //! function boundary.
 
-use std::fmt;
+use std::{borrow::Cow, fmt, str::FromStr};
 
-use serde::{Deserialize, Serialize};
+use serde::{Deserialize, Deserializer, Serialize, Serializer, de};
+use thiserror::Error;
+
+/// Of a text that is no id, shown in the error.
+const SHOWN_CHARACTERS: usize = 64;
+
+/// A text is not an id as it is shown.
+#[derive(Clone, Debug, PartialEq, Eq, Error)]
+#[error("{text:?} is no id")]
+pub struct NoId {
+    /// Its first characters.
+    pub text: String,
+}
 
 macro_rules! id {
     ($(#[$doc:meta])* $name:ident($raw:ty), $prefix:literal) => {
@@ -20,11 +32,12 @@ macro_rules! id {
 }
 
 /// An id that a coordinator issues: its epoch less one in the upper half, a running number in the lower. Shown as
-/// `epoch.number`, in the first epoch as the number alone.
+/// `epoch.number`, in the first epoch as the number alone. What people read (JSON) has it as it is shown: as a number it can be over
+/// 2^53, where JavaScript and jq round.
 macro_rules! issued_id {
     ($(#[$doc:meta])* $name:ident, $prefix:literal) => {
         $(#[$doc])*
-        #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+        #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
         pub struct $name(pub u64);
 
         impl fmt::Display for $name {
@@ -33,6 +46,42 @@ macro_rules! issued_id {
                     0 => write!(f, concat!($prefix, "{}"), self.0),
                     before => write!(f, concat!($prefix, "{}.{}"), before + 1, self.0 & 0xffff_ffff),
                 }
+            }
+        }
+
+        impl FromStr for $name {
+            type Err = NoId;
+
+            fn from_str(text: &str) -> Result<Self, NoId> {
+                let issued = text.strip_prefix($prefix).and_then(|rest| match rest.split_once('.') {
+                    None => rest.parse::<u32>().ok().map(u64::from),
+                    Some((epoch, number)) => {
+                        let before = u32::try_from(epoch.parse::<u64>().ok()?.checked_sub(1)?).ok()?;
+                        Some(u64::from(before) << 32 | u64::from(number.parse::<u32>().ok()?))
+                    }
+                });
+                // Another spelling is none of ours.
+                let issued = issued.map(Self).filter(|id| id.to_string() == text);
+                issued.ok_or_else(|| NoId { text: text.chars().take(SHOWN_CHARACTERS).collect() })
+            }
+        }
+
+        impl Serialize for $name {
+            fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+                match serializer.is_human_readable() {
+                    true => serializer.collect_str(self),
+                    false => self.0.serialize(serializer),
+                }
+            }
+        }
+
+        impl<'de> Deserialize<'de> for $name {
+            fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+                if deserializer.is_human_readable() {
+                    let text = Cow::<'de, str>::deserialize(deserializer)?;
+                    return text.parse().map_err(de::Error::custom);
+                }
+                u64::deserialize(deserializer).map(Self)
             }
         }
     };
@@ -192,5 +241,35 @@ impl fmt::Debug for ContentHash {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         // Eight hex digits tell contents apart in a log line.
         self.0[..4].iter().try_for_each(|byte| write!(f, "{byte:02x}"))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn issued_ids_are_read_as_they_are_shown() {
+        for (id, shown) in
+            [(0, "app-0"), (7, "app-7"), (1 << 32 | 7, "app-2.7"), (u64::MAX, "app-4294967296.4294967295")]
+        {
+            let id = AppId(id);
+            assert_eq!(id.to_string(), shown);
+            assert_eq!(shown.parse(), Ok(id));
+        }
+        for text in [
+            "",
+            "app-",
+            "7",
+            "node-7",
+            "app-1.7",
+            "app-0.7",
+            "app-07",
+            "app-4294967296",
+            "app-2.7.1",
+            "app- 7",
+        ] {
+            assert_eq!(text.parse::<AppId>(), Err(NoId { text: text.to_owned() }), "{text}");
+        }
     }
 }
