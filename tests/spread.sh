@@ -3,6 +3,7 @@
 # network namespaces, the application's link carries 1 Gbit/s. Needs root, iproute2 and binaries.
 #
 #   BIN=target/release tests/spread.sh [SCENE]
+#   PEERS=no tests/spread.sh       nodes do not reach each other: each fetches from the application
 #
 # Prints the bytes that left the application in a first render and in a second one of the same scene, and when the last
 # node began its first job. Without a scene it writes one of some 100 MB.
@@ -64,6 +65,10 @@ ip -n glspread-app link set eth0 mtu 1500
 ip netns exec glspread-app tc qdisc add dev eth0 root tbf rate 1gbit burst 256kb latency 50ms
 for node in $(seq "$nodes"); do
     host "$node" "$node"
+    for peer in $(seq "$nodes"); do
+        [ "${PEERS:-yes}" = yes ] || [ "$peer" = "$node" ] ||
+            ip -n "glspread-$node" route add unreachable "$net.$peer/32"
+    done
     ip netns exec "glspread-$node" "$bin/farm-worker" --coordinator "$net.254:4100" --listen "$net.$node:0" \
         --name "node-$node" --device cpu >"$work/node-$node" 2>"$work/node-$node.log" &
     pids="$pids $!"
