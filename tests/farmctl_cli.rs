@@ -9,7 +9,7 @@ use std::{
 
 use serde_json::Value;
 use tempfile::TempDir;
-use tests::{Farm, Process, binary, farmctl};
+use tests::{Farm, Process, command, farmctl};
 
 fn text(bytes: &[u8]) -> String {
     String::from_utf8_lossy(bytes).into_owned()
@@ -34,7 +34,7 @@ fn status_shows_nodes_and_devices_as_json() {
 
 #[test]
 fn a_farm_whose_own_worker_was_drained_says_so_and_ends_in_order() {
-    let mut up = Command::new(binary("farmctl"))
+    let mut up = command("farmctl")
         .args(["up", "--listen", "127.0.0.1:0", "--http", "127.0.0.1:0"])
         .args(["--device", "sim:score=1000,speed=1.0"])
         .stdout(Stdio::piped())
@@ -61,7 +61,7 @@ fn a_farm_whose_own_worker_was_drained_says_so_and_ends_in_order() {
 #[test]
 fn a_watch_ends_when_its_reader_does() {
     let farm = Farm::coordinator();
-    let mut watch = Command::new(binary("farmctl"))
+    let mut watch = command("farmctl")
         .args(["--coordinator", &farm.grpc, "status", "--watch", "100ms"])
         .stdout(Stdio::piped())
         .spawn()

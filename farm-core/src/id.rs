@@ -40,11 +40,20 @@ macro_rules! issued_id {
         #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
         pub struct $name(pub u64);
 
+        impl $name {
+            /// The running number alone: that of another epoch may be the same.
+            #[must_use]
+            #[expect(clippy::cast_possible_truncation, reason = "the lower half")]
+            pub const fn number(self) -> u32 {
+                self.0 as u32
+            }
+        }
+
         impl fmt::Display for $name {
             fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
                 match self.0 >> 32 {
-                    0 => write!(f, concat!($prefix, "{}"), self.0),
-                    before => write!(f, concat!($prefix, "{}.{}"), before + 1, self.0 & 0xffff_ffff),
+                    0 => write!(f, concat!($prefix, "{}"), self.number()),
+                    before => write!(f, concat!($prefix, "{}.{}"), before + 1, self.number()),
                 }
             }
         }

@@ -43,7 +43,8 @@ pub fn binary(name: &str) -> PathBuf {
 }
 
 /// A workspace binary that does not know the farms of whoever runs the tests.
-fn command(name: &str) -> Command {
+#[must_use]
+pub fn command(name: &str) -> Command {
     isolated(Command::new(binary(name)))
 }
 

@@ -177,17 +177,16 @@ fn read(arguments: &MiArgs) -> Result<Input, Failure> {
     // Better now than after hours: a folder that cannot be written to.
     drop(NamedTempFile::new_in(&arguments.folder).with_context(|| shown(&arguments.folder))?);
     let path = arguments.folder.join(SUMS);
+    let load =
+        |sums: &[u8]| saved::load(&alignment, Seed(arguments.seed), sums).with_context(|| shown(&path));
     let earlier = match (fs::read(&path), arguments.extend) {
         // Written by the run that the journal is of, which ended before it could remove it: the same sums will follow.
         (Ok(sums), false) if arguments.resume && journal_path(arguments).exists() => {
-            let there = saved::load(&alignment, Seed(arguments.seed), &sums)
-                .with_context(|| shown(&path))
-                .map_err(Failure::Usage)?;
-            if there.iterations() as u64 > arguments.iterations {
+            let there = load(&sums).map_err(Failure::Usage)?.iterations();
+            if there as u64 > arguments.iterations {
                 let reason = anyhow!(
-                    "{} has {} iterations: another run's, which is not written over",
-                    shown(&path),
-                    there.iterations()
+                    "{} has {there} iterations: another run's, which is not written over",
+                    shown(&path)
                 );
                 return Err(Failure::Usage(reason));
             }
@@ -200,9 +199,7 @@ fn read(arguments: &MiArgs) -> Result<Input, Failure> {
             );
             return Err(Failure::Usage(reason));
         }
-        (Ok(sums), true) => {
-            Some(saved::load(&alignment, Seed(arguments.seed), &sums).with_context(|| shown(&path))?)
-        }
+        (Ok(sums), true) => Some(load(&sums)?),
         (Err(error), false) if error.kind() == io::ErrorKind::NotFound => None,
         (Err(error), _) => return Err(anyhow::Error::new(error).context(shown(&path)).into()),
     };

@@ -65,18 +65,11 @@ fn choose(name: &str, head: &TimelineHead) -> Result<(Option<AppId>, Option<Task
         Some((app, task)) => (app, Some(task)),
         None => (name, None),
     };
-    let app = app.strip_prefix("app-").unwrap_or(app);
-    let of_this_name = |short: bool| {
-        let name = move |candidate: &&TimelineApp| {
-            let id = candidate.app.to_string();
-            let id = id.strip_prefix("app-").unwrap_or(&id);
-            // Without the coordinator's life before it.
-            let id = if short { id.rsplit_once('.').map_or(id, |(_, number)| number) } else { id };
-            id == app
-        };
-        head.apps.iter().rev().find(name)
-    };
-    let found = of_this_name(false).or_else(|| of_this_name(true)).ok_or_else(unknown)?;
+    let wanted: AppId =
+        format!("app-{}", app.strip_prefix("app-").unwrap_or(app)).parse().map_err(|_| unknown())?;
+    // A number alone is of any life of the coordinator where the first one had none.
+    let of_number = || head.apps.iter().rev().find(|ran| u64::from(ran.app.number()) == wanted.0);
+    let found = head.apps.iter().find(|ran| ran.app == wanted).or_else(of_number).ok_or_else(unknown)?;
     let Some(task) = task else { return Ok((Some(found.app), None)) };
     let task = task.strip_prefix("task-").unwrap_or(task);
     let ran = found.tasks.iter().map(|(task, _)| *task).find(|ran| ran.0.to_string() == task);

@@ -4,13 +4,12 @@ use std::net::{SocketAddr, ToSocketAddrs as _};
 
 use coordinator::CoordinatorOptions;
 use serde_json::json;
-use tokio::signal::unix::{Signal, SignalKind, signal};
 
-use crate::{cli::UpArgs, embedded::EmbeddedFarm, failure::Failure, output};
+use crate::{cli::UpArgs, embedded::EmbeddedFarm, failure::Failure, output, running::Stops};
 
 /// Runs a farm until SIGINT or SIGTERM, then drains it; a second signal ends the process at once.
 pub(crate) async fn run(arguments: &UpArgs) -> Result<(), Failure> {
-    let (mut interrupt, mut terminate) = (signal(SignalKind::interrupt())?, signal(SignalKind::terminate())?);
+    let mut stops = Stops::listen()?;
     let options = CoordinatorOptions {
         listen: resolve("--listen", &arguments.listen)?,
         http: resolve("--http", &arguments.http)?,
@@ -31,25 +30,16 @@ pub(crate) async fn run(arguments: &UpArgs) -> Result<(), Failure> {
     tell!("farmctl: the farm is up; status page http://{}; Ctrl-C ends it", farm.coordinator().http_addr());
 
     tokio::select! {
-        () = asked_to_end(&mut interrupt, &mut terminate) => {}
+        () = stops.recv() => {}
         why = farm.worker_left() => {
             tell!("farmctl: the worker of this process has left ({why}); others may join the farm; Ctrl-C ends it");
-            asked_to_end(&mut interrupt, &mut terminate).await;
+            stops.recv().await;
         }
     }
     tell!("farmctl: draining; again to end at once");
     tokio::select! {
         () = farm.stop() => Ok(()),
-        () = asked_to_end(&mut interrupt, &mut terminate) => {
-            Err(Failure::Work(anyhow::anyhow!("ended before the farm was drained")))
-        }
-    }
-}
-
-async fn asked_to_end(interrupt: &mut Signal, terminate: &mut Signal) {
-    tokio::select! {
-        _ = interrupt.recv() => {}
-        _ = terminate.recv() => {}
+        () = stops.recv() => Err(Failure::Work(anyhow::anyhow!("ended before the farm was drained"))),
     }
 }
 
